@@ -1,0 +1,38 @@
+"""What every test runs under: float64, strict runs on request, and a compilation cache that outlives the run."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+# Before JAX is imported anywhere: subprocesses that a test starts must find the same cache. The variable wins.
+CACHE = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".cache" / "jax")))
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_compilation_cache_dir", str(CACHE))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@pytest.fixture
+def strict() -> Iterator[None]:
+    """Forbid implicit dtype promotion: an array of integers may not meet one of floats without a cast."""
+    with jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+@pytest.fixture(params=["float64", "float32"])
+def precision(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Run the test twice, in double and in single precision; the value is the name of the dtype."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+@pytest.fixture
+def float32() -> Iterator[None]:
+    """Run the test in single precision, as a user does by default."""
+    with jax.enable_x64(False):
+        yield
