@@ -1,0 +1,46 @@
+# make setup | reproduce | test | lint | clean      (PYTHON=... and VENV=... choose another interpreter, another place)
+
+VENV ?= .venv
+SCALE ?= quick
+SEED ?= 0
+.DEFAULT_GOAL := setup
+.DELETE_ON_ERROR:
+.PHONY: setup reproduce test lint clean lock
+
+# The first interpreter that runs and is new enough; a name alone proves nothing (version managers leave shims).
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
+	$$p -c '$(SUPPORTED)' >/dev/null 2>&1 && { command -v $$p; break; }; done)
+
+setup: $(VENV)/.ready
+
+# Two stamps, each written last: an interrupted setup is done again, a finished one never.
+$(VENV)/.locked: requirements.lock
+	@'$(PYTHON)' -c '$(SUPPORTED)' 2>/dev/null || { \
+	  echo "make: expected Python 3.11 to 3.13, found '$(or $(PYTHON),none)'; install one, or name it: make PYTHON=/path/to/python3" >&2; \
+	  exit 1; }
+	'$(PYTHON)' -m venv --clear '$(VENV)'
+	'$(VENV)/bin/python' -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@touch '$@'
+
+$(VENV)/.ready: $(VENV)/.locked pyproject.toml
+	'$(VENV)/bin/python' -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch '$@'
+
+reproduce: setup
+	'$(VENV)/bin/lgmdjax' reproduce --scale $(SCALE) --seed $(SEED)
+
+test: setup
+	'$(VENV)/bin/python' -m pytest $(ARGS)
+
+lint: setup
+	'$(VENV)/bin/ruff' check .
+	'$(VENV)/bin/pyright' --pythonpath '$(VENV)/bin/python'
+
+clean:
+	rm -rf '$(VENV)' .cache build dist .pytest_cache .ruff_cache .hypothesis
+
+# For maintainers, with uv on the path: the newest versions that pyproject.toml allows, for every supported Python.
+lock:
+	uv pip compile pyproject.toml --extra dev --extra notebooks --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command 'make lock' --output-file requirements.lock
