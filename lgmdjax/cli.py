@@ -1,0 +1,126 @@
+"""The command line: one function a subcommand, whose arguments are its flags.
+
+What a user can get wrong ends in one line on stderr and exit code 2; an interruption in 130.
+"""
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from lgmdjax import __version__
+from lgmdjax.errors import InputError
+from lgmdjax.scales import SCALES, Scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pipeline:
+    """Which run folder, and what it is made with."""
+
+    scale: Scale = "quick"
+    """smoke goes through every stage in minutes, quick shows the result, paper uses the paper's figures"""
+    out: Path = Path("runs")
+    """folder of the run folders"""
+    seed: int = 0
+    """seed of everything that is drawn at random"""
+    name: str = ""
+    """name of the run folder; <scale>-<seed> if empty"""
+
+
+Flags = Annotated[Pipeline, tyro.conf.arg(name="")]
+
+
+def reproduce(pipeline: Flags) -> None:
+    """Fit the gait, collect, train, evaluate, and leave a report; what is done already is skipped."""
+    print(f"open {_execute(pipeline, 'report') / 'index.html'}")
+
+
+def fit_gait(pipeline: Flags) -> None:
+    """Teach the shaping networks the regular tripod gait."""
+    _execute(pipeline, "fit-gait")
+
+
+def collect(pipeline: Flags) -> None:
+    """Record the teacher's walks in training rooms (and the gait before, if it is not there)."""
+    _execute(pipeline, "collect")
+
+
+def train(pipeline: Flags) -> None:
+    """Fit the navigator to the recorded walks (and what they need, if it is not there)."""
+    _execute(pipeline, "train")
+
+
+def evaluate(pipeline: Flags) -> None:
+    """Walk all drivers through unseen rooms (and do the stages before, if they are not there)."""
+    _execute(pipeline, "evaluate")
+
+
+def report(pipeline: Flags) -> None:
+    """Write the report page (and do the stages before, if they are not there)."""
+    print(f"open {_execute(pipeline, 'report') / 'index.html'}")
+
+
+def doctor(*, out: Path = Path("runs")) -> int:
+    """Check this machine: versions, devices, known miscompilation, physics, video, disk; exit code 1 on a FAIL.
+
+    Args:
+        out: the folder that runs would be written to
+    """
+    from lgmdjax.doctor import examine
+
+    return examine(out)
+
+
+COMMANDS: dict[str, Callable[..., int | None]] = {
+    "reproduce": reproduce,
+    "fit-gait": fit_gait,
+    "collect": collect,
+    "train": train,
+    "evaluate": evaluate,
+    "report": report,
+    "doctor": doctor,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; give the exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if list(arguments) == ["--version"]:
+        print(f"lgmdjax {__version__}")
+        return 0
+    _keep_compilations()
+    try:
+        code = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, prog="lgmdjax", args=arguments, description="A hexapod that walks by the eyes of a locust."
+        )
+    except (InputError, OSError) as error:
+        print(f"lgmdjax: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("lgmdjax: interrupted; the same command carries on", file=sys.stderr)
+        return 130
+    return code or 0
+
+
+def _execute(pipeline: Pipeline, target: str) -> Path:
+    from lgmdjax.runs import execute, open_run
+    from lgmdjax.stages import STAGES
+
+    name = pipeline.name or f"{pipeline.scale}-{pipeline.seed}"
+    run = open_run(pipeline.out, name, pipeline.scale, pipeline.seed, SCALES[pipeline.scale])
+    return execute(run, STAGES, target)
+
+
+def _keep_compilations() -> None:
+    """Keep compiled programs between commands, unless the user has a place for them: JAX reads these on import."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
