@@ -65,7 +65,7 @@ def report(pipeline: Flags) -> None:
 
 
 def doctor(*, out: Path = Path("runs")) -> int:
-    """Check this machine: versions, devices, known miscompilation, physics, video, disk; exit code 1 on a FAIL.
+    """Check this machine: versions, devices, arithmetic, physics, video, disk; exit code 1 on a FAIL.
 
     Args:
         out: the folder that runs would be written to
@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _keep_compilations()
     try:
         code = tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="lgmdjax", args=arguments, description="A hexapod that walks by the eyes of a locust."
+            COMMANDS, prog="lgmdjax", args=arguments, description="A hexapod with the eyes of a locust."
         )
     except (InputError, OSError) as error:
         print(f"lgmdjax: {' '.join(str(error).split())}", file=sys.stderr)
@@ -116,7 +116,7 @@ def _execute(pipeline: Pipeline, target: str) -> Path:
 
 
 def _keep_compilations() -> None:
-    """Keep compiled programs between commands, unless the user has a place for them: JAX reads these on import."""
+    """Keep compiled programs between commands, where the user says if so; JAX reads this on import."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")

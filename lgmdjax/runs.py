@@ -1,12 +1,12 @@
 """Run folders: a stage is done once, carries on after an interruption, and never leaves half a result.
 
     runs/<name>/run.json                   scale, seed, settings and versions that the run was made with
-    runs/<name>/<stage>.partial-<print>/   while the stage works; stays when it is interrupted, for it to carry on from
+    runs/<name>/<stage>.partial-<print>/   while the stage works; stays when interrupted, to carry on from
     runs/<name>/<stage>/                   its files, moved here in one step once all of them are written
     runs/<name>/<stage>/done.json          its fingerprint, files, seconds of the last try, versions, device
 
-The fingerprint of a stage covers its settings, the seed, the version of its format and the fingerprints of its inputs:
-a stage whose folder carries the fingerprint that it would get now has nothing to do.
+The fingerprint of a stage covers its settings, the seed, the version of its format and the fingerprints of
+its inputs: a stage whose folder carries the fingerprint that it would get now has nothing to do.
 """
 
 import contextlib
@@ -29,8 +29,8 @@ from lgmdjax.errors import InputError
 FORMAT = 1  # of the run folder; a change makes every stage of an older folder run again
 PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx")
 
-# Writes its files into the folder (first argument), which may hold what an interrupted try left there; reads the
-# finished folders of its input stages, by their names; gets its own settings and the run's seed.
+# Writes its files into the folder (first argument), which may hold what an interrupted try left there; reads
+# the finished folders of its input stages, by their names; gets its own settings and the run's seed.
 Work = Callable[[Path, Mapping[str, Path], Any, int], None]
 
 
@@ -70,7 +70,7 @@ def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str,
     Raises InputError when the folder cannot be written, or was made with another scale, seed or settings.
     """
     if name in ("", ".", "..") or Path(name).name != name:
-        raise InputError(f"expected a plain folder name for the run, got {name!r}; leave the slashes to --out")
+        raise InputError(f"expected a plain folder name for the run, got {name!r}; use --out for the path")
     if seed < 0:
         raise InputError(f"expected a seed of 0 or more, got {seed}; choose another --seed")
     folder = out / name
@@ -83,8 +83,9 @@ def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str,
             write_json(folder / "run.json", asked | {"versions": versions()})
         (folder / ".lock").touch()
     except OSError as error:
+        reason = error.strerror or error
         raise InputError(
-            f"expected a folder that can be written, got {folder} ({error.strerror or error}); choose another --out"
+            f"expected a folder that can be written, got {folder} ({reason}); choose another --out"
         ) from error
     return Run(folder=folder, seed=seed, settings=settings)
 
@@ -141,8 +142,8 @@ def _do(run: Run, stage: Stage, print_: str) -> None:
         inputs = {name: run.folder / name for name in stage.inputs}
         stage.work(partial, inputs, run.settings[stage.name], run.seed)
         seconds = time.perf_counter() - began
-        facts = {"fingerprint": print_, "seconds": round(seconds, 1), "versions": versions(), "device": device()}
-        write_json(partial / "done.json", facts | {"files": _sizes(partial)})
+        stamp = {"fingerprint": print_, "seconds": round(seconds, 1), "versions": versions()}
+        write_json(partial / "done.json", stamp | {"device": device(), "files": _sizes(partial)})
         print(f"{stage.name}: done in {seconds:.0f} s", flush=True)
     if final.exists():
         shutil.rmtree(final)
@@ -228,6 +229,6 @@ def _alone(folder: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(
-                f"expected {folder} to be free, got a run at work in it; wait for it, or choose another --name"
+                f"expected {folder} to be free, got a run at work in it; wait, or choose another --name"
             ) from error
         yield

@@ -1,8 +1,9 @@
 """The stages of `lgmdjax reproduce`, in order: what each reads, does and writes.
 
-Every stage is a function of the folder that it writes into, the finished folders of its inputs by name, its settings
-(`lgmdjax.scales`) and the run's seed; `lgmdjax.runs` decides when it runs and moves its files into place. A folder may
-hold what an interrupted try left there, which a stage carries on from or overwrites. Heavy modules are imported inside.
+Every stage is a function of the folder that it writes into, the finished folders of its inputs by name, its
+settings (`lgmdjax.scales`) and the run's seed; `lgmdjax.runs` decides when it runs and moves its files into
+place. A folder may hold what an interrupted try left there, which a stage carries on from or overwrites. Heavy
+modules are imported inside.
 """
 
 from collections.abc import Mapping

@@ -1,11 +1,12 @@
-"""What every test runs under: float64, strict runs on request, and a compilation cache that outlives the run."""
+"""What every test runs under: float64, strict types on request, a compilation cache that outlives the run."""
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
-# Before JAX is imported anywhere: subprocesses that a test starts must find the same cache. The variable wins.
-CACHE = Path(os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".cache" / "jax")))
+# Before JAX is imported anywhere, and as a variable: subprocesses of a test must find the same cache.
+ROOT = Path(__file__).parent.parent
+CACHE = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
@@ -13,7 +14,7 @@ import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_compilation_cache_dir", str(CACHE))
+jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

@@ -20,4 +20,4 @@ def test_float32_is_single() -> None:
 @pytest.mark.usefixtures("strict")
 def test_strict_refuses_mixed_types() -> None:
     with pytest.raises(Exception, match="dtype_promotion=strict"):
-        jnp.ones(1) + jnp.arange(1)
+        _ = jnp.ones(1) + jnp.arange(1)

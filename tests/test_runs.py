@@ -74,11 +74,13 @@ def run(tmp_path: Path) -> Run:
     return open_run(tmp_path, "try", "smoke", 5, SETTINGS)
 
 
-def test_a_finished_run_has_nothing_to_do(pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_finished_run_has_nothing_to_do(
+    pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert pipeline.execute(run) == ["left", "right", "total"]
     assert (run.folder / "total" / "value.txt").read_text() == "21"
     began = capsys.readouterr().out
-    assert "total: starts on cpu" in began and "seed 5" in began and str(run.folder) in began and "jax" in began
+    assert all(word in began for word in ("total: starts on cpu", "seed 5", str(run.folder), "jax"))
     assert pipeline.execute(run) == []
     assert capsys.readouterr().out.count("up to date") == 3
 
@@ -172,7 +174,7 @@ def test_a_kill_at_any_moment_can_be_carried_on_from(tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         if sys.argv[2] == "die":
             move = os.replace
-            os.replace = lambda source, target: die() if str(target).endswith("stage") else move(source, target)
+            os.replace = lambda source, to: die() if str(to).endswith("stage") else move(source, to)
         run = runs.open_run(Path(sys.argv[1]), "try", "smoke", 0, {"stage": 1})
         print(runs.execute(run, [runs.Stage(name="stage", work=work)], "stage"))
     """)
@@ -200,7 +202,7 @@ def test_other_settings_are_refused(tmp_path: Path, run: Run) -> None:
         ("smoke", 6, SETTINGS, "seed = 6"),
         ("smoke", 5, SETTINGS | {"left": Number(3)}, "settings.left.value = 3"),
     ]:
-        with pytest.raises(InputError, match=f"expected .*{named}, got .* made with .*; choose another --name"):
+        with pytest.raises(InputError, match=f"expected .*{named}, got .* made with .*; choose"):
             open_run(tmp_path, "try", scale, seed, settings)
     assert open_run(tmp_path, "try", "smoke", 5, SETTINGS) == run
 
