@@ -1,8 +1,8 @@
 """How much of everything: the settings of each stage at the three scales.
 
 `smoke` goes through every stage in minutes and proves nothing about the robot; `quick` is the smallest that
-shows the result; `paper` uses the paper's figures (15 minutes of data, 1000 epochs, 235.3 m). A setting stands
-here when the scale or an experiment changes it; physical numbers belong to the components' `Params`.
+shows the result; `paper` uses the paper's figures (15 minutes of data, 1000 epochs, 235.3 m). A setting
+stands here when the scale or an experiment changes it; physical numbers belong to the components' `Params`.
 """
 
 from collections.abc import Mapping

@@ -2,8 +2,8 @@
 
 Every stage is a function of the folder that it writes into, the finished folders of its inputs by name, its
 settings (`lgmdjax.scales`) and the run's seed; `lgmdjax.runs` decides when it runs and moves its files into
-place. A folder may hold what an interrupted try left there, which a stage carries on from or overwrites. Heavy
-modules are imported inside.
+place. A folder may hold what an interrupted try left there, which a stage carries on from or overwrites.
+Heavy modules are imported inside.
 """
 
 from collections.abc import Mapping
