@@ -1,50 +1,68 @@
 """The world a robot walks in: a walled room with upright boxes and cylinders, all of it arrays.
 
-Every obstacle is a prism that stands upright: a box turned about the vertical, or a cylinder. It may hang above
-the floor (a table top, a tree's crown). Each kind is padded to a static number with prisms parked far away and
-under the floor, so that every robot of a batch has a room of its own: `vmap` over a batched `Arena`.
+Every obstacle is an upright prism (`lgmdjax.prisms`), and may hang overhead: a table top, a tree's crown.
+Each kind is padded to a static number with prisms parked far away under the floor, so that every robot of a
+batch has a room of its own: `vmap` over a batched `Arena`.
 
 World frame: x forward, y left, z up, floor at z = 0; metres, radians, seconds.
 
-| symbol | name                           | unit          | where                                                  |
-| ------ | ------------------------------ | ------------- | ------------------------------------------------------ |
-| c(t)   | centre of a prism at time t    | m             | c + (goal - c) clip((t - departs)/(arrives - departs)) |
-| a, b   | half_size in the prism's frame | m             | a cylinder has its radius twice                        |
-| psi    | yaw of the prism               | rad           |                                                        |
-| tau    | texture row                    | see `TEXTURE` | brightness, contrast, phase, scale                     |
-| h      | handedness of all textures     | 1 or -1       | a pattern is a function of (x, h y, z) in the frame of |
-|        |                                |               | its prism (walls and floor: of the world)              |
+A texture row is brightness, contrast, phase, scale (`prisms.TEXTURE`). A pattern is a function of (x, h y, z)
+in the frame of its prism, or of the world for walls and floor, with the room's `handedness` h = 1 or -1.
 
-Source: sec. 5 of the paper (its figure 10 shows the rooms).
+A robot cannot step onto or over anything here, nor crawl under it: what stands on the floor reaches above the
+robot, and what does not starts above it (`validate`). Touching is then a problem in the plane, and exact.
+
+Source: sec. 5 of the paper (its figure 10 shows the rooms; `lgmdjax.scenes` builds them).
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jax import Array
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
-BOXES = CYLINDERS = 12
-PARKED = 1.0e3
-"""Where padding is parked: x = y = 1 km [m]."""
-TEXTURE = ("brightness", "contrast", "phase", "scale")
-"""Columns of a texture row: mean grey 0..255, contrast 0..1, pattern offset [rad], coarsest wavelength [m]."""
-PLAIN = (128.0, 0.0, 0.0, 0.5)
+from lgmdjax.errors import InputError
+from lgmdjax.prisms import (
+    COUNT,
+    PARKED,
+    Prisms,
+    distance_to_boxes,
+    distance_to_cylinders,
+    is_parked,
+    join,
+    mirrored,
+    moved,
+    parked,
+    place,
+)
 
+__all__ = [
+    "COUNT",
+    "PARKED",
+    "ROBOT_HEIGHT",
+    "Arena",
+    "Prisms",
+    "at",
+    "clearance",
+    "empty_room",
+    "free_pose",
+    "free_poses",
+    "is_overhead",
+    "is_parked",
+    "margins",
+    "mirror",
+    "nearest",
+    "parked",
+    "place",
+    "validate",
+    "walls",
+]
 
-@struct.dataclass(kw_only=True)
-class Prisms:
-    """A padded set of upright prisms of one kind."""
-
-    centre: Float[Array, "n 2"]
-    half_size: Float[Array, "n 2"]
-    yaw: Float[Array, " n"]
-    bottom: Float[Array, " n"]
-    top: Float[Array, " n"]
-    texture: Float[Array, "n 4"]
-    goal: Float[Array, "n 2"]
-    departs: Float[Array, " n"]
-    arrives: Float[Array, " n"]
+ROBOT_HEIGHT = 0.35
+"""Nothing of the robot is ever higher [m]; the parting line between obstacles and what hangs overhead."""
 
 
 @struct.dataclass(kw_only=True)
@@ -67,57 +85,6 @@ class Arena:
     """1, or -1 in a mirrored room: textures take h y for y, so that their patterns are mirrored too."""
 
 
-def place(
-    centre: ArrayLike,
-    half_size: ArrayLike,
-    top: ArrayLike,
-    *,
-    yaw: ArrayLike = 0.0,
-    bottom: ArrayLike = 0.0,
-    texture: ArrayLike = PLAIN,
-    goal: ArrayLike | None = None,
-    departs: ArrayLike = 0.0,
-    arrives: ArrayLike = 0.0,
-    count: int = BOXES,
-) -> Prisms:
-    """Set up prisms at `centre` (n, 2), the rest broadcast to n rows, padded with parked ones to `count`."""
-    centre = jnp.asarray(centre, dtype=float).reshape(-1, 2)
-    rows = centre.shape[0]
-
-    def fill(value: ArrayLike, *width: int) -> Array:
-        return jnp.broadcast_to(jnp.asarray(value, dtype=float), (rows, *width))
-
-    real = Prisms(
-        centre=centre,
-        half_size=fill(half_size, 2),
-        yaw=fill(yaw),
-        bottom=fill(bottom),
-        top=fill(top),
-        texture=fill(texture, 4),
-        goal=centre if goal is None else fill(goal, 2),
-        departs=fill(departs),
-        arrives=fill(arrives),
-    )
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), real, parked(count - rows))
-
-
-def parked(count: int) -> Prisms:
-    """Padding: `count` small plain prisms far away under the floor, where no ray and no robot meets them."""
-    far = jnp.full((count, 2), PARKED, dtype=float)
-    zero = jnp.zeros(count, dtype=float)
-    return Prisms(
-        centre=far,
-        half_size=jnp.full((count, 2), 0.05, dtype=float),
-        yaw=zero,
-        bottom=zero - 0.2,
-        top=zero - 0.1,
-        texture=jnp.broadcast_to(jnp.asarray(PLAIN, dtype=float), (count, 4)),
-        goal=far,
-        departs=zero,
-        arrives=zero,
-    )
-
-
 def empty_room(
     size: ArrayLike = (6.0, 6.0),
     *,
@@ -132,8 +99,8 @@ def empty_room(
     """Build a room of `size` (x, y) centred at the origin, with the prisms given and nothing else in it."""
     x, y = 0.5 * jnp.asarray(size, dtype=float)
     return Arena(
-        boxes=parked(BOXES) if boxes is None else boxes,
-        cylinders=parked(CYLINDERS) if cylinders is None else cylinders,
+        boxes=parked() if boxes is None else boxes,
+        cylinders=parked() if cylinders is None else cylinders,
         room=jnp.stack([-x, x, -y, y]),
         wall_height=jnp.asarray(wall_height, dtype=float),
         wall_texture=jnp.broadcast_to(jnp.asarray(wall_texture, dtype=float), (4, 4)),
@@ -145,37 +112,158 @@ def empty_room(
 
 
 def at(arena: Arena, time: ArrayLike) -> Arena:
-    """Move the obstacles to where they are at `time` [s]; the result is a still room.
-
-    c(t) = c + (goal - c) clip((t - departs)/(arrives - departs), 0, 1); with arrives = departs it jumps.
-    """
-    return arena.replace(boxes=_moved(arena.boxes, time), cylinders=_moved(arena.cylinders, time))
-
-
-def _moved(prisms: Prisms, time: ArrayLike) -> Prisms:
-    duration = prisms.arrives - prisms.departs
-    moves = duration > 0
-    late = jnp.asarray(time, dtype=duration.dtype) - prisms.departs
-    fraction = jnp.clip(late / jnp.where(moves, duration, 1.0), 0.0, 1.0)
-    fraction = jnp.where(moves, fraction, jnp.where(late >= 0, 1.0, 0.0))
-    centre = prisms.centre + fraction[..., None] * (prisms.goal - prisms.centre)
-    return prisms.replace(centre=centre, goal=centre)
+    """Move the obstacles to where they are at `time` [s]; the result is a still room."""
+    return dataclasses.replace(arena, boxes=moved(arena.boxes, time), cylinders=moved(arena.cylinders, time))
 
 
 def mirror(arena: Arena) -> Arena:
     """Reflect the room in its x axis: y -> -y, yaw -> -yaw, walls y_min and y_max swapped, textures too."""
-    flip = jnp.asarray([1.0, -1.0], dtype=arena.room.dtype)
-
-    def reflected(prisms: Prisms) -> Prisms:
-        return prisms.replace(centre=prisms.centre * flip, goal=prisms.goal * flip, yaw=-prisms.yaw)
-
     order = jnp.asarray([0, 1, 3, 2])
-    sign = jnp.asarray([1.0, 1.0, -1.0, -1.0], dtype=arena.room.dtype)
-    return arena.replace(
-        boxes=reflected(arena.boxes),
-        cylinders=reflected(arena.cylinders),
-        room=(arena.room * sign)[order],
+    flip = jnp.asarray([1.0, 1.0, -1.0, -1.0], dtype=arena.room.dtype)
+    return dataclasses.replace(
+        arena,
+        boxes=mirrored(arena.boxes),
+        cylinders=mirrored(arena.cylinders),
+        room=(arena.room * flip)[order],
         wall_texture=arena.wall_texture[order],
-        start=arena.start * jnp.asarray([1.0, -1.0, -1.0], dtype=arena.room.dtype),
+        start=arena.start * flip[1:],
         handedness=-arena.handedness,
     )
+
+
+def clearance(
+    arena: Arena, starts: Float[Array, "s 3"], ends: Float[Array, "s 3"], radii: Float[Array, " s"]
+) -> Float[Array, " s"]:
+    """Measure the signed distance [m] of capsules to the nearest obstacle or wall, negative inside.
+
+    Exact, and a problem in the plane, since what stands on the floor is higher than the robot and what hangs
+    overhead cannot be touched; the floor does not count.
+    Gradient: that of the nearest feature; zero where a cylinder's axis cuts a capsule's.
+    """
+    p, q = starts[..., :2], ends[..., :2]
+    low, high = arena.room[0::2], arena.room[1::2]
+    to_walls = jnp.minimum(jnp.minimum(p, q) - low, high - jnp.maximum(p, q))
+    hits = [_to_boxes(arena.boxes, p, q), _to_cylinders(arena.cylinders, p, q), to_walls]
+    return jnp.min(jnp.concatenate(hits, axis=-1), axis=-1) - radii
+
+
+def _to_boxes(boxes: Prisms, p: Array, q: Array) -> Array:
+    return jnp.where(is_overhead(boxes), jnp.inf, distance_to_boxes(boxes, p, q))
+
+
+def _to_cylinders(cylinders: Prisms, p: Array, q: Array) -> Array:
+    return jnp.where(is_overhead(cylinders), jnp.inf, distance_to_cylinders(cylinders, p, q))
+
+
+def is_overhead(prisms: Prisms) -> Bool[Array, " n"]:
+    """Tell which prisms hang above the robot."""
+    return prisms.bottom >= ROBOT_HEIGHT
+
+
+def nearest(
+    arena: Arena, position: Float[Array, "2"], boxes: int = 3, cylinders: int = 2
+) -> tuple[Prisms, Prisms]:
+    """Pick what the physics must know of at (x, y): so many nearest boxes, walls among them, and cylinders.
+
+    The counts are static; where a room has fewer, the rest are parked. Gradient: through the prisms picked.
+    """
+    solid = join(arena.boxes, walls(arena))
+    point = position[None]
+    return (
+        _least(solid, _to_boxes(solid, point, point)[0], boxes),
+        _least(arena.cylinders, _to_cylinders(arena.cylinders, point, point)[0], cylinders),
+    )
+
+
+def _least(prisms: Prisms, distance: Array, count: int) -> Prisms:
+    chosen = jax.lax.top_k(-distance, count)[1]
+    return jax.tree.map(lambda leaf: leaf[chosen], prisms)
+
+
+def walls(arena: Arena, thickness: float = 1.0) -> Prisms:
+    """Turn the walls into four boxes behind their inner faces, in the order of `room`."""
+    x_min, x_max, y_min, y_max = arena.room
+    x, y, half = 0.5 * (x_min + x_max), 0.5 * (y_min + y_max), 0.5 * thickness
+    length, width = 0.5 * (x_max - x_min) + thickness, 0.5 * (y_max - y_min) + thickness
+    centre = [[x_min - half, y], [x_max + half, y], [x, y_min - half], [x, y_max + half]]
+    half_size = [[half, width], [half, width], [length, half], [length, half]]
+    boxes = place(
+        jnp.asarray(centre), jnp.asarray(half_size), arena.wall_height, texture=arena.wall_texture, count=4
+    )
+    return jax.tree.map(lambda leaf: leaf.astype(arena.room.dtype), boxes)
+
+
+def margins(arena: Arena, poses: Float[Array, "n 3"], ahead: float = 0.3) -> Float[Array, " n"]:
+    """Measure the room [m] about poses (x, y, yaw), and about the line to `ahead` [m] in front of them."""
+    xy, yaw = poses[:, :2], poses[:, 2]
+    front = xy + ahead * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
+    return clearance(arena, xy, front, jnp.zeros_like(yaw))
+
+
+def free_pose(key: Array, arena: Arena, margin: float = 0.45) -> Float[Array, "3"]:
+    """Draw one pose (x, y, yaw) as `free_poses` does."""
+    return free_poses(key, arena, 1, margin)[0]
+
+
+def free_poses(key: Array, arena: Arena, count: int, margin: float = 0.45) -> Float[Array, "count 3"]:
+    """Draw poses (x, y, yaw), each uniform among those whose `margins` are at least `margin` [m].
+
+    Of 64 candidates the first free one; where none is, the room's own `start`: no pose is a bad one.
+    """
+    low, high = arena.room[0::2], arena.room[1::2]
+    # Drawn in float32 and cast, so that a key means the same poses at any precision.
+    draws = jax.random.uniform(key, (count, 64, 3), dtype=jnp.float32).astype(low.dtype)
+    xy, yaw = low + draws[..., :2] * (high - low), 2.0 * jnp.pi * draws[..., 2:] - jnp.pi
+    poses = jnp.concatenate([xy, yaw], axis=-1)
+    free = jax.vmap(lambda row: margins(arena, row) >= margin)(poses)
+    first = jnp.take_along_axis(poses, jnp.argmax(free, axis=1)[:, None, None], axis=1)[:, 0]
+    return jnp.where(jnp.any(free, axis=1)[:, None], first, arena.start)
+
+
+def validate(arena: Arena) -> Arena:
+    """Check a room, or a batch, on the host and hand it back; raises InputError for the first fault."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(arena):
+        _require(np.isfinite(leaf), f"finite numbers in {jax.tree_util.keystr(path).strip('.')}", leaf)
+    x_min, x_max, y_min, y_max = np.moveaxis(np.asarray(arena.room), -1, 0)
+    _require((x_min < x_max) & (y_min < y_max), "room as x_min < x_max, y_min < y_max", arena.room)
+    _require(np.asarray(arena.wall_height) >= ROBOT_HEIGHT, "walls above the robot", arena.wall_height)
+    _require(np.abs(arena.handedness) == 1, "handedness 1 or -1", arena.handedness)
+    _validate_texture("walls", arena.wall_texture)
+    _validate_texture("floor", arena.floor_texture)
+    _validate_prisms("boxes", arena.boxes)
+    _validate_prisms("cylinders", arena.cylinders)
+    radii = np.asarray(arena.cylinders.half_size)
+    _require(radii[..., 0] == radii[..., 1], "a cylinder's radius twice", radii)
+    axes = arena.room.ndim - 1
+    rooms = jax.tree.map(lambda leaf: jnp.reshape(leaf, (-1, *leaf.shape[axes:])), at(arena, 0.0))
+    space = jax.vmap(lambda room: margins(room, room.start[None], ahead=0.0)[0])(rooms)
+    _require(np.asarray(space).reshape(arena.room.shape[:-1]) > 0, "a start pose that is free", arena.start)
+    return arena
+
+
+def _validate_prisms(kind: str, prisms: Prisms) -> None:
+    bottom, top = np.asarray(prisms.bottom), np.asarray(prisms.top)
+    spans = np.stack([bottom, top], axis=-1)
+    stands = (bottom <= 0) & (top >= ROBOT_HEIGHT)
+    clear = np.asarray(is_overhead(prisms) | is_parked(prisms))
+    _require(np.asarray(prisms.half_size) > 0, f"positive sizes of {kind}", prisms.half_size)
+    _require(bottom < top, f"tops of {kind} above their bottoms", spans)
+    _require(stands | clear, f"{kind} from the floor to above {ROBOT_HEIGHT} m, or wholly above it", spans)
+    _require(prisms.arrives >= prisms.departs, f"{kind} that arrive after they depart", prisms.arrives)
+    _validate_texture(kind, prisms.texture)
+
+
+def _validate_texture(of: str, texture: Array) -> None:
+    brightness, contrast, _, scale = np.moveaxis(np.asarray(texture), -1, 0)
+    _require((brightness >= 0) & (brightness <= 255), f"brightness of {of} in 0..255", brightness)
+    _require((contrast >= 0) & (contrast <= 1), f"contrast of {of} in 0..1", contrast)
+    _require(scale > 0, f"texture scales of {of} above 0 m", scale)
+
+
+def _require(good: ArrayLike, expected: str, got: ArrayLike) -> None:
+    """Raise for the first place where it is not `good`."""
+    bad = np.argwhere(~np.asarray(good))
+    if bad.size:
+        place = tuple(int(i) for i in bad[0])
+        where = f" at {place}" if place else ""
+        raise InputError(f"expected {expected}, got {np.asarray(got)[place]}{where}; mend the room")
