@@ -1,0 +1,260 @@
+"""Lobula giant movement detector: the locust's neuron that fires when something comes straight at an eye.
+
+One eye. A picture is compared with the last one; every cell is excited by its own change and inhibited, a
+frame later, by the changes around it. Edges that spread faster than the inhibition get through: those of an
+approaching object. Whole-field motion (a fast turn) is recognised by its total change and silences the cell.
+
+| symbol    | name                        | unit        | equation |
+| --------- | --------------------------- | ----------- | -------- |
+| L_f       | frame                       | grey 0..255 | 7        |
+| P_f       | difference                  | grey        | 7        |
+| I_f       | layers.inhibition           | grey        | 8        |
+| w_I       | kernel                      | 1           | 9        |
+| E_f       | layers.excitation           | grey        | 10       |
+| S_f       | layers.summation            | grey        | 11       |
+| W_I       | inhibition                  | 1           | 11       |
+| T_s       | threshold                   | grey        | 12       |
+| U_f/n     | response.excitation         | grey        | 13, 14   |
+| u_f       | response.u                  | 1, 0.5..1   | 14, 16   |
+| FF        | response.feed_forward       | grey        | 15       |
+| T_f       | suppression                 | grey        | 16       |
+
+Source: Cizek & Faigl, sec. 3.3; Blanchard, Rind & Verschure 2000. Two equations contradict the text as
+printed and are corrected: eq. 15 averages the signed change, which is zero for a moving edge
+(`printed_feed_forward`), and eq. 16 keeps u when FF is high, where the text says that high FF suppresses it
+(`printed_gate`). Cells outside the picture are zero.
+
+The kernel sums to 2.92, times W_I to 1.168: where a change repeats itself, summation is negative and only
+fresh edges pass. The frame after `init` has no last change yet, hence no inhibition either.
+
+Gradient: thresholds are steps, so those of T_s and T_f are zero and the others' are exact almost everywhere.
+With `smooth` both steps are sigmoids of a width in grey levels, which tend to the steps as it tends to zero.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgmdjax.errors import InputError
+
+LEFT, RIGHT = 0, 1
+REACH = 2  # n of eq. 8: a cell is inhibited by cells up to two rows or columns away
+STILL = 0.5  # u of a cell that sees nothing move
+
+# w_I (eq. 9)
+KERNEL = (
+    (0.06, 0.12, 0.25, 0.12, 0.06),
+    (0.12, 0.06, 0.12, 0.06, 0.12),
+    (0.25, 0.12, 0.00, 0.12, 0.25),
+    (0.12, 0.06, 0.12, 0.06, 0.12),
+    (0.06, 0.12, 0.25, 0.12, 0.06),
+)
+
+
+@struct.dataclass(kw_only=True)
+class Params:
+    """The detector's constants. T_s and T_f hang on resolution, textures and speed: `lgmdjax.calibration`."""
+
+    threshold: Float[Array, ""] | float = 6.0  # T_s, grey
+    suppression: Float[Array, ""] | float = 20.0  # T_f, grey
+    inhibition: Float[Array, ""] | float = 0.4  # W_I
+    kernel: Float[Array, "5 5"] = struct.field(default_factory=lambda: jnp.asarray(KERNEL, dtype=float))
+    threshold_width: Float[Array, ""] | float = 1.0  # grey, of the smooth threshold
+    suppression_width: Float[Array, ""] | float = 1.0  # grey, of the smooth gate
+    smooth: bool = struct.field(pytree_node=False, default=False)  # sigmoids in the place of steps
+    printed_feed_forward: bool = struct.field(pytree_node=False, default=False)  # eq. 15: signed mean
+    printed_gate: bool = struct.field(pytree_node=False, default=False)  # eq. 16: low FF suppresses
+
+
+@struct.dataclass(kw_only=True)
+class State:
+    """The last picture L_{f-1} and the last change P_{f-1}."""
+
+    frame: Float[Array, "height width"]
+    difference: Float[Array, "height width"]
+
+
+@struct.dataclass(kw_only=True)
+class Response:
+    """What one frame makes of the two single cells."""
+
+    u: Float[Array, ""]  # eqs. 14, 16
+    feed_forward: Float[Array, ""]  # FF, eq. 15 [grey]
+    excitation: Float[Array, ""]  # U / n_cell, eqs. 13, 14 [grey]; what u would be told by without the gate
+
+
+@struct.dataclass(kw_only=True)
+class Layers:
+    """The layers of cells of one frame, in grey levels, for drawing."""
+
+    difference: Float[Array, "height width"]  # P, eq. 7
+    excitation: Float[Array, "height width"]  # E, eq. 10
+    inhibition: Float[Array, "height width"]  # I, eq. 8
+    summation: Float[Array, "height width"]  # S, eq. 11, before the threshold
+
+
+def init(params: Params, frame: Float[Array, "height width"]) -> State:
+    """Open the eye on a first picture: nothing has changed yet."""
+    _require_picture(frame)
+    return State(frame=frame, difference=jnp.zeros_like(frame))
+
+
+def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
+    """Show the next picture (eqs. 7-16).
+
+    Raises `InputError`, when traced, if the picture has another size than the last one or is not of floats.
+
+    Gradient: see the module; |.| of eqs. 8, 10 and 13 has slope 0 at 0.
+    """
+    cells = layers(params, state, frame)
+    U = mean_excitation(params, cells.summation, params.threshold)
+    FF = _feed_forward(params, state.difference)
+    u = STILL + _pass(params, FF) * (jax.nn.sigmoid(U) - STILL)
+    return State(frame=frame, difference=cells.difference), Response(u=u, feed_forward=FF, excitation=U)
+
+
+def layers(params: Params, state: State, frame: Float[Array, "height width"]) -> Layers:
+    """Evaluate the layers of cells for the next picture (eqs. 7-11)."""
+    _require_picture(frame, state.frame.shape)
+    P = frame - state.frame
+    E = jnp.abs(P)
+    I = inhibit(params.kernel, state.difference)  # noqa: E741
+    return Layers(difference=P, excitation=E, inhibition=I, summation=E - jnp.abs(I) * params.inhibition)
+
+
+def inhibit(
+    kernel: Float[Array, "5 5"], difference: Float[Array, "height width"]
+) -> Float[Array, "height width"]:
+    """Spread the last change over the neighbours (eq. 8), zero beyond the border.
+
+    The kernel is taken as the mean of its four mirror images, so that left and right eye stay mirror images
+    of each other whatever is learned, and so that rows can be added in pairs before they are weighted: 13
+    products a cell instead of 25, which XLA makes one vectorised loop of (`lax.conv` takes 30 times as long
+    on a CPU).
+    """
+    height, width = difference.shape
+    padded = jnp.pad(difference, REACH)
+    quarter = _quarter(kernel).astype(difference.dtype)
+
+    def row(i: int) -> Array:
+        return lax.slice_in_dim(padded, REACH + i, REACH + i + height, axis=0)
+
+    def moved(column: Array, j: int) -> Array:
+        return lax.slice_in_dim(column, REACH + j, REACH + j + width, axis=1)
+
+    rows = (row(0), row(1) + row(-1), row(2) + row(-2))
+    inner, near, far = (w[0] * rows[0] + w[1] * rows[1] + w[2] * rows[2] for w in quarter.T)
+    return moved(inner, 0) + moved(near, 1) + moved(near, -1) + moved(far, 2) + moved(far, -2)
+
+
+def mean_excitation(
+    params: Params, summation: Float[Array, "height width"], threshold: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """Average what passes T_s over the cells (eqs. 12, 13, and the division of eq. 14) [grey]."""
+    S, margin = summation, summation - threshold
+    if params.smooth:
+        passed = S * jax.nn.sigmoid(margin / params.threshold_width)
+    else:
+        passed = jnp.where(margin >= 0, S, 0.0)
+    return _mean(jnp.abs(passed))
+
+
+def excitations(
+    params: Params,
+    state: State,
+    frame: Float[Array, "height width"],
+    thresholds: Float[Array, "candidates"],
+) -> tuple[State, Response]:
+    """Show the next picture to many detectors that differ in T_s only, at little more than the price of one.
+
+    Everything before the threshold is evaluated once. The response's `u` and `excitation` have an axis of
+    candidates; the gate is left open, since T_f is chosen afterwards (`lgmdjax.calibration`).
+    """
+    cells = layers(params, state, frame)
+    U = lax.map(lambda threshold: mean_excitation(params, cells.summation, threshold), thresholds)
+    FF = _feed_forward(params, state.difference)
+    response = Response(u=jax.nn.sigmoid(U), feed_forward=FF, excitation=U)
+    return State(frame=frame, difference=cells.difference), response
+
+
+def hemifield(picture: Array | np.ndarray, side: int, overlap: float) -> Array | np.ndarray:
+    """Cut out what one eye looks at: the left eye the first columns, the right eye the last ones.
+
+    Args:
+        picture: the eye's whole picture; leading axes are kept.
+        side: `LEFT` or `RIGHT`.
+        overlap: fraction of the width that an eye keeps; 0.5 is no overlap, 1 the whole picture.
+    """
+    if not 0.5 <= overlap <= 1:
+        raise InputError(
+            f"lgmd overlap: expected a fraction of the width in 0.5..1, got {overlap}; 0.5 is no overlap"
+        )
+    if side not in (LEFT, RIGHT):
+        raise InputError(f"lgmd side: expected 0 (left) or 1 (right), got {side}; see lgmd.LEFT, lgmd.RIGHT")
+    width = jnp.shape(picture)[-1]
+    kept = math.ceil(overlap * width)
+    return picture[..., :kept] if side == LEFT else picture[..., width - kept :]
+
+
+def check(params: Params) -> None:
+    """Raise `InputError` if a constant is negative or not finite, or the kernel not its own mirror image."""
+    for name in ("threshold", "suppression", "inhibition", "kernel"):
+        value = np.asarray(getattr(params, name), dtype=float)
+        if not np.all(np.isfinite(value) & (value >= 0)):
+            raise InputError(f"lgmd {name}: expected finite numbers >= 0, got {value.min()}; see lgmd.Params")
+    for name in ("threshold_width", "suppression_width"):
+        if not 0 < float(getattr(params, name)) < math.inf:
+            raise InputError(
+                f"lgmd {name}: expected a positive grey level, got {getattr(params, name)}; the default is 1"
+            )
+    w = np.asarray(params.kernel)
+    if w.shape != (2 * REACH + 1, 2 * REACH + 1):
+        raise InputError(f"lgmd kernel: expected shape (5, 5), got {w.shape}; eq. 9 is lgmd.KERNEL")
+    if not (np.allclose(w, w[::-1]) and np.allclose(w, w[:, ::-1])):
+        raise InputError(
+            "lgmd kernel: expected its own mirror image, got other weights on one side; average them"
+        )
+
+
+def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
+    """Fold the kernel at its middle: weights by distance in rows and columns, mirror images averaged."""
+    w = (kernel + kernel[::-1]) / 2
+    return ((w + w[:, ::-1]) / 2)[REACH:, REACH:]
+
+
+def _feed_forward(params: Params, difference: Float[Array, "height width"]) -> Float[Array, ""]:
+    """Average the last change over the picture (eq. 15), its size unless the printed form is asked for."""
+    return _mean(difference if params.printed_feed_forward else jnp.abs(difference))
+
+
+def _pass(params: Params, FF: Float[Array, ""]) -> Float[Array, ""]:
+    """Open the gate (1) or close it (0) by the feed-forward cell (eq. 16)."""
+    above = FF - params.suppression
+    if params.smooth:
+        return jax.nn.sigmoid((above if params.printed_gate else -above) / params.suppression_width)
+    fast = above > 0
+    return jnp.where(fast if params.printed_gate else ~fast, jnp.ones_like(FF), jnp.zeros_like(FF))
+
+
+def _mean(cells: Float[Array, "height width"]) -> Float[Array, ""]:
+    """Average over all cells, rows by a product with ones: XLA's sum adds one by one on a CPU."""
+    ones = jnp.ones(cells.shape[1], cells.dtype)
+    return jnp.sum(jnp.matmul(cells, ones, precision=lax.Precision.HIGHEST)) / cells.size
+
+
+def _require_picture(frame: Array, shape: tuple[int, ...] | None = None) -> None:
+    if jnp.ndim(frame) != 2 or not jnp.issubdtype(frame.dtype, jnp.floating):
+        raise InputError(
+            f"lgmd: expected a picture of floats, grey 0..255, shape (height, width), got {frame.dtype} "
+            f"{frame.shape}; use frame.astype(float), and vmap for several eyes"
+        )
+    if shape is not None and frame.shape != shape:
+        raise InputError(
+            f"lgmd: expected a picture of {shape[1]} x {shape[0]} as before, got {frame.shape[1]} x "
+            f"{frame.shape[0]}; keep one resolution, or init again"
+        )
