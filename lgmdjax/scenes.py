@@ -18,10 +18,12 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from lgmdjax.arena import Arena, clearance, empty_room
-from lgmdjax.prisms import COUNT, Prisms, join, parked, place
+from lgmdjax.prisms import COUNT, Prisms, join, parked, place, turned
 
 GAP = 0.8
 """Least way between obstacles, and about a start [m]: twice the robot's width."""
+DRAWS = 128
+"""Places that an obstacle of a random room is tried at."""
 
 # x, y, half sizes (a cylinder: radius twice) [m], yaw [deg], height [m].
 _TRAINING_BOXES = (
@@ -134,52 +136,64 @@ def random_room(
     """Draw a room of 6 to 8 m a side with `density` obstacles a square metre, boxes and cylinders in turn.
 
     They stand at least `gap` [m] apart and from the walls, and `GAP` from the start, so that it is free and
-    every other place can be reached. Each has 32 draws to find such a place or stays parked, and there are at
-    most the static numbers of `boxes` and `cylinders`: count what stands with `prisms.is_parked`.
+    every other place can be reached. Each is tried at `DRAWS` places or stays parked, and there are at most
+    `boxes` and `cylinders` (static): count what stands with `prisms.is_parked`. Rooms fill up at about 0.25.
     """
-    size_key, start_key, turns_key, texture_key = jax.random.split(key, 4)
-    size = _uniform(size_key, (2,), 6.0, 8.0)
-    start = _uniform(start_key, (3,), -1.0, 1.0) * jnp.append(0.5 * size - GAP, jnp.pi)
+    room_key, things_key, texture_key = jax.random.split(key, 3)
+    draws = _uniform(room_key, (5,))
+    size = 6.0 + 2.0 * draws[:2]
+    start = (2.0 * draws[2:] - 1.0) * jnp.append(0.5 * size - GAP, jnp.pi)
     arena = empty_room(size, boxes=parked(boxes), cylinders=parked(cylinders), start=start)
     wanted = jnp.asarray(density, dtype=float) * size[0] * size[1]
+    rounds = max(boxes, cylinders)
 
-    def turn(arena: Arena, index: Array) -> tuple[Arena, None]:
+    def turn(arena: Arena, row: tuple[Array, Array]) -> tuple[Arena, None]:
+        index, draws = row
         before = 2.0 * index.astype(wanted.dtype)
-        key, other_key = jax.random.split(jax.random.fold_in(turns_key, index))
-        box = _random_box(key)
-        box, fits = _find_place(key, arena, box, jnp.linalg.norm(box.half_size), gap)
+        box, fits = _random_box(draws[0], arena, gap)
         arena = dataclasses.replace(arena, boxes=_put(arena.boxes, index, box, fits & (before < wanted)))
-        drum = _random_cylinder(other_key)
-        drum, fits = _find_place(other_key, arena, drum, drum.half_size[0, 0], gap)
-        stands = fits & (before + 1.0 < wanted)
-        return dataclasses.replace(arena, cylinders=_put(arena.cylinders, index, drum, stands)), None
+        cylinder, fits = _random_cylinder(draws[1], arena, gap)
+        fits = fits & (before + 1.0 < wanted)
+        return dataclasses.replace(arena, cylinders=_put(arena.cylinders, index, cylinder, fits)), None
 
-    arena, _ = jax.lax.scan(turn, arena, jnp.arange(max(boxes, cylinders)))
+    draws = _uniform(things_key, (rounds, 2, 4 + 2 * DRAWS))
+    arena, _ = jax.lax.scan(turn, arena, (jnp.arange(rounds), draws))
     return faded(textured(arena, texture_key), contrast)
 
 
-def _random_box(key: Array) -> Prisms:
-    width, depth, yaw, top = _uniform(jax.random.fold_in(key, 0), (4,), 0.0, 1.0)
-    half_size = jnp.stack([0.12 + 0.28 * width, 0.12 + 0.28 * depth])
-    return place([[0.0, 0.0]], half_size, 0.5 + top, yaw=jnp.pi * (yaw - 0.5), count=1)
+def _random_box(draws: Array, arena: Arena, gap: float) -> tuple[Prisms, Bool[Array, ""]]:
+    """Make a box and find a place for it; is there one?"""
+    width, depth, turn, rise = draws[:4]
+    half_size = 0.12 + 0.28 * jnp.stack([width, depth])
+    yaw = jnp.pi * (turn - 0.5)
+    signs = jnp.asarray([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]], dtype=float)
+    corners = turned(signs * half_size, yaw)
+    centre, fits = _find_place(draws[4:], arena, corners, jnp.zeros_like(yaw), gap)
+    return place(centre, half_size, 0.5 + rise, yaw=yaw, count=1), fits
 
 
-def _random_cylinder(key: Array) -> Prisms:
-    radius, top = _uniform(jax.random.fold_in(key, 0), (2,), 0.0, 1.0)
-    return place([[0.0, 0.0]], 0.08 + 0.22 * radius, 0.5 + top, count=1)
+def _random_cylinder(draws: Array, arena: Arena, gap: float) -> tuple[Prisms, Bool[Array, ""]]:
+    """Make a cylinder and find a place for it; is there one?"""
+    thickness, rise = draws[:2]
+    radius = 0.08 + 0.22 * thickness
+    centre, fits = _find_place(draws[4:], arena, jnp.zeros((1, 2), dtype=float), radius, gap)
+    return place(centre, radius, 0.5 + rise, count=1), fits
 
 
 def _find_place(
-    key: Array, arena: Arena, prism: Prisms, reach: Array, gap: float
-) -> tuple[Prisms, Bool[Array, ""]]:
-    """Move one prism to the first of 32 draws at which the circle about it clears all else; was there one?"""
+    draws: Array, arena: Arena, corners: Float[Array, "n 2"], radius: Array, gap: float
+) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    """Find the first of `DRAWS` places at which a polygon, rounded by `radius`, clears all; is there one?"""
     low, high = arena.room[0::2], arena.room[1::2]
-    places = low + _uniform(jax.random.fold_in(key, 1), (32, 2), 0.0, 1.0) * (high - low)
-    space = clearance(arena, places, places, jnp.broadcast_to(reach, (32,)))
+    places = low + draws.reshape(DRAWS, 2) * (high - low)
+    p = places[:, None] + corners
+    q = places[:, None] + jnp.roll(corners, 1, axis=0)
+    radii = jnp.broadcast_to(radius, (DRAWS * len(corners),))
+    space = clearance(arena, p.reshape(-1, 2), q.reshape(-1, 2), radii).reshape(DRAWS, -1)
+    reach = radius + jnp.max(jnp.linalg.norm(corners, axis=-1))
     from_start = jnp.linalg.norm(places - arena.start[:2], axis=-1) - reach
-    free = (space >= gap) & (from_start >= GAP)
-    centre = places[jnp.argmax(free)][None]
-    return dataclasses.replace(prism, centre=centre, goal=centre), jnp.any(free)
+    free = (jnp.min(space, axis=-1) >= gap) & (from_start >= GAP)
+    return places[jnp.argmax(free)], jnp.any(free)
 
 
 def _put(prisms: Prisms, index: Array, prism: Prisms, stands: Bool[Array, ""]) -> Prisms:
@@ -188,21 +202,23 @@ def _put(prisms: Prisms, index: Array, prism: Prisms, stands: Bool[Array, ""]) -
 
 
 def textured(arena: Arena, key: Array | None = None) -> Arena:
-    """Draw textures for everything in a room: obstacles stand out, walls are bright, floors are duller."""
-    keys = jax.random.split(jax.random.key(0) if key is None else key, 5)
+    """Draw textures for everything in a room: obstacles stand out, walls are bright, floors duller."""
     boxes, cylinders = arena.boxes, arena.cylinders
+    first, second = boxes.yaw.size, boxes.yaw.size + cylinders.yaw.size
+    draws = _uniform(jax.random.key(0) if key is None else key, (second + 6, 4))
 
-    def rows(key: Array, count: int, low: tuple, high: tuple) -> Float[Array, "count 4"]:
-        return _uniform(key, (count, 4), jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float))
+    def between(draws: Array, low: tuple[float, ...], high: tuple[float, ...]) -> Float[Array, "... 4"]:
+        least, most = jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
+        return least + draws * (most - least)
 
-    things = (40.0, 0.5, 0.0, 0.10), (190.0, 1.0, 2.0 * jnp.pi, 0.40)
+    things = between(draws[:second], (40.0, 0.5, 0.0, 0.10), (190.0, 1.0, 2.0 * jnp.pi, 0.40))
     return dataclasses.replace(
         arena,
-        boxes=dataclasses.replace(boxes, texture=rows(keys[0], boxes.yaw.size, *things)),
-        cylinders=dataclasses.replace(cylinders, texture=rows(keys[1], cylinders.yaw.size, *things)),
-        wall_texture=rows(keys[2], 4, (130.0, 0.2, 0.0, 0.3), (220.0, 0.7, 2.0 * jnp.pi, 1.0)),
-        floor_texture=rows(keys[3], 1, (80.0, 0.2, 0.0, 0.2), (150.0, 0.6, 2.0 * jnp.pi, 0.6))[0],
-        sky=_uniform(keys[4], (), 200.0, 250.0),
+        boxes=dataclasses.replace(boxes, texture=things[:first]),
+        cylinders=dataclasses.replace(cylinders, texture=things[first:]),
+        wall_texture=between(draws[second:-2], (130.0, 0.2, 0.0, 0.3), (220.0, 0.7, 2.0 * jnp.pi, 1.0)),
+        floor_texture=between(draws[-2], (80.0, 0.2, 0.0, 0.2), (150.0, 0.6, 2.0 * jnp.pi, 0.6)),
+        sky=200.0 + 50.0 * draws[-1, 0],
     )
 
 
@@ -228,7 +244,6 @@ def _prisms(rows: tuple[tuple[float, ...], ...], count: int = COUNT) -> Prisms:
     return place(table[:, :2], table[:, 2:4], table[:, 5], yaw=jnp.deg2rad(table[:, 4]), count=count)
 
 
-def _uniform(key: Array, shape: tuple[int, ...], low: float | Array, high: float | Array) -> Array:
-    """Draw in float32 and cast, so that a key means the same room at any precision."""
-    share = jax.random.uniform(key, shape, dtype=jnp.float32).astype(float)
-    return low + share * (high - low)
+def _uniform(key: Array, shape: tuple[int, ...]) -> Array:
+    """Draw from 0..1 in float32 and cast, so that a key means the same room at any precision."""
+    return jax.random.uniform(key, shape, dtype=jnp.float32).astype(float)
