@@ -3,6 +3,8 @@
 What a user can get wrong ends in one line on stderr and exit code 2; an interruption in 130.
 """
 
+import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -70,6 +72,7 @@ def doctor(*, out: Path = Path("runs")) -> int:
     Args:
         out: the folder that runs would be written to
     """
+    _import_physics()
     from lgmdjax.doctor import examine
 
     return examine(out)
@@ -92,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if list(arguments) == ["--version"]:
         print(f"lgmdjax {__version__}")
         return 0
-    _keep_compilations()
+    _prepare_jax()
     try:
         code = tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="lgmdjax", args=arguments, description="A hexapod with the eyes of a locust."
@@ -112,14 +115,23 @@ def _execute(pipeline: Pipeline, target: str) -> Path:
 
     name = pipeline.name or f"{pipeline.scale}-{pipeline.seed}"
     run = open_run(pipeline.out, name, pipeline.scale, pipeline.seed, SCALES[pipeline.scale])
+    _import_physics()
     return execute(run, STAGES, target)
 
 
-def _keep_compilations() -> None:
-    """Keep compiled programs between commands, where the user says if so; JAX reads this on import."""
+def _prepare_jax() -> None:
+    """Set what JAX reads on import, where the user has not: compiled programs are kept, and less noise."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    # XLA reports its own tuning flags as errors whenever it reads a compiled program back; real ones raise.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def _import_physics() -> None:
+    """Import MJX without the lines that it prints about an optional back end."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        import mujoco.mjx  # noqa: F401
 
 
 if __name__ == "__main__":
