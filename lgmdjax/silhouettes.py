@@ -1,132 +1,178 @@
-"""Upright prisms as an eye sees them: a wedge of directions, closed above and below, over faces of inverse depth.
+"""Upright prisms as an eye sees them: a wedge of directions, limited above and below, over faces of inverse depth.
 
-From an eye, the plane n . x = c is 1/t = s . d on the ray d, with s = n/c: inverse depth is linear in the direction. So
-a box needs no division a ray: it is entered where the greatest ... of its near faces, and every outline of a prism is
-where two such functions are equal. A cylinder's side is locally such a plane too.
+From an eye, the plane n . x = c is at 1/t = s . d on the ray d, with s = n/c: inverse depth is linear in the
+direction, so a box needs no division a ray, and an outline is where two such functions are equal. Where a ray meets
+a cylinder, the plane that touches it there takes the face's place.
 
-| symbol      | name                                               | unit | where                              |
-| ----------- | -------------------------------------------------- | ---- | ---------------------------------- |
-| o           | centre of the prism from the eye, in the plane     | m    |                                    |
-| d           | direction of a ray, h its part in the plane        | 1    |                                    |
-| s           | face as inverse depth                              | 1/m  | 1/t = s . d                        |
-| z_t, z_b    | top and bottom above the eye                       | m    |                                    |
-| n_l, n_r    | inward normals of the upright planes that touch it | 1    | inside if n_l . d > 0, n_r . d > 0 |
-| c           | power of the eye to a cylinder                     | m2   | o^2 - r^2                          |
+| symbol   | name                                               | unit | where                              |
+| -------- | -------------------------------------------------- | ---- | ---------------------------------- |
+| o        | centre of the prism from the eye, in the plane     | m    |                                    |
+| d        | direction of a ray                                 | 1    |                                    |
+| s        | face as inverse depth                              | 1/m  | 1/t = s . d                        |
+| z_t, z_b | top and bottom above the eye                       | m    |                                    |
+| n_l, n_r | inward normals of the upright planes that touch it | 1    | inside if n_l . d > 0, n_r . d > 0 |
+| c        | power of the eye to a cylinder                     | m2   | o^2 - r^2                          |
+
+An eye sees at most one lid, the top from above or the bottom from below. The lid ends where its far sides begin,
+the opposite end of the prism where its near sides end.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from lgmdjax import texture
+from lgmdjax.arena import Arena
 from lgmdjax.prisms import Prisms, is_parked, turned
 
-_NEAR = 1.0e-4
+NEAR = 1.0e-4
 """Nothing is nearer to an eye than this [m]; what is, counts as this."""
 _OPEN = 1.0e4
-"""A margin in pixels, or an inverse depth, that stands for no limit at all."""
+"""A margin [px], or an inverse depth [1/m], that stands for no limit at all."""
+
+Pair = tuple[Array, Array]
 
 
 class Silhouette(NamedTuple):
-    """One prism, or an array of them, as an eye sees it; all plane vectors in world axes."""
+    """One prism, or an array of them, as an eye sees it; plane vectors in world axes. All zero: nothing."""
 
-    left: tuple[Array, Array]
-    """n_l; zero where the eye is above or below the prism."""
-    right: tuple[Array, Array]
+    left: Pair
+    """n_l; zero where the eye is above or below the prism, within its wedge."""
+    right: Pair
     open: Array
-    """Margin [px] added to n . d: half a pixel; 1 where there are no sides, 0 where there is no prism."""
-    top: Array
-    bottom: Array
+    """Margin [px] added to n . d: half a pixel; 1 where the wedge is all around, 0 where there is no prism."""
+    lid_end: Array
+    """z of the end with the lid; of the top if no lid is seen."""
+    other_end: Array
+    upward: Array
+    """1 if the lid's end is the top, else -1."""
+    lid_open: Array
+    """Margin [px] added to the one of the lid's end: half a pixel, or _OPEN where it is no limit."""
+    other_open: Array
     lid: Array
-    """1/z of the top or the bottom, whichever the eye sees; 0 if neither."""
-    unclosed_top: Array
-    """Margin [px] that takes the upper limit away, where the eye looks up from within the wedge."""
-    unclosed_bottom: Array
-    within: Array
-    """_OPEN where the eye is above or below the prism, where it can enter by the lid only; else 0."""
-    axis: tuple[Array, Array]
-    """The box's own x axis."""
-    near_x: tuple[Array, Array]
-    """s of the box's near face across its x axis; that of the other pair of faces where there is none."""
-    near_y: tuple[Array, Array]
-    far_x: tuple[Array, Array]
-    """1/distance of the one or two faces across the box's x axis through which rays leave."""
-    far_y: tuple[Array, Array]
+    """1/z of the lid; 0 where none is seen."""
+    lid_bias: Array
+    """Inverse depth by which the lid lies further ahead than it does: _OPEN if there is no other way in, minus that
+    if there is no lid."""
+    axis: Pair
+    """A box's x axis."""
+    near_x: Pair
+    """s of a box's near face across its x axis; that of the other pair of faces where the eye is between."""
+    near_y: Pair
+    far_x: Pair
+    """1/distance of the faces across a box's x axis by which rays leave, in its direction and against it."""
+    far_y: Pair
     round: Array
     """1 for a cylinder, 0 for a box."""
-    centre: tuple[Array, Array]
+    centre: Pair
     radius_square: Array
-    polar: tuple[Array, Array]
+    polar: Pair
     """o/c of a cylinder."""
     texture: texture.Texture
 
 
 class Bounds(NamedTuple):
-    """What is needed to sort out which prisms may be seen where: distance [m] and elevations [rad] of each."""
+    """What sorts out where a prism may be seen: its least distance [m] and its range of elevations [rad]."""
 
     nearest: Array
     lowest: Array
     highest: Array
+    within: Array
 
 
-def of_boxes(boxes: Prisms, eye: Float[Array, "3"]) -> tuple[Silhouette, Bounds]:
-    """Look at boxes from an eye."""
+def look(arena: Arena, eye: Float[Array, "3"]) -> tuple[Silhouette, Bounds]:
+    """Look at all prisms of a room from an eye, the nearest first."""
+    seen = (_of_boxes(arena.boxes, eye), _of_cylinders(arena.cylinders, eye))
+    silhouettes, bounds = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *seen)
+    order = jnp.argsort(lax.stop_gradient(bounds.nearest))
+    return jax.tree.map(lambda a: a[order], (silhouettes, bounds))
+
+
+def may_show(
+    silhouettes: Silhouette, bounds: Bounds, axes: Float[Array, "cones 3"], radii: Float[Array, " cones"]
+) -> Array:
+    """Tell which prisms (last axis) may show in cones of directions: no side of the outline shuts the cone out."""
+    radius = radii[:, None]
+    x, y, z = (axes[:, i, None] for i in range(3))
+    elevation = jnp.arcsin(jnp.clip(z, -1.0, 1.0))
+    slack = jnp.sin(jnp.minimum(radius, 0.5 * jnp.pi))
+    from_left = silhouettes.left[0] * x + silhouettes.left[1] * y > -slack
+    from_right = silhouettes.right[0] * x + silhouettes.right[1] * y > -slack
+    level = (elevation + radius > bounds.lowest) & (elevation - radius < bounds.highest)
+    return ((from_left & from_right) | bounds.within) & level & (silhouettes.open > 0)
+
+
+def pick(silhouettes: Silhouette, shows: Array, slots: int) -> list[Silhouette]:
+    """Give each cone the first `slots` prisms that may show in it: silhouettes of (cones,) each, zero where unused.
+
+    Sorting one by one would be slow: their number in the queue is a product with a triangle of ones, and what they
+    hand over a product with the one-hot numbers, exact and differentiable.
+    """
+    leaves, structure = jax.tree.flatten(silhouettes)
+    table = jnp.stack(leaves, axis=-1)
+    present = shows.astype(table.dtype)
+    count = table.shape[0]
+    number = present @ jnp.triu(jnp.ones((count, count), dtype=table.dtype))
+    numbers = jnp.arange(1, min(slots, count) + 1, dtype=table.dtype)[:, None]
+    chosen = jnp.where((number[:, None] == numbers) & shows[:, None], 1.0, 0.0).astype(table.dtype)
+    picked = jnp.einsum("tkn,nf->tkf", chosen, table, precision=lax.Precision.HIGHEST)
+    return [
+        jax.tree.unflatten(structure, [picked[:, k, i] for i in range(len(leaves))])
+        for k in range(numbers.shape[0])
+    ]
+
+
+def _of_boxes(boxes: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
     o = boxes.centre - eye[:2]
-    x_axis = turned(jnp.asarray([1.0, 0.0], dtype=o.dtype), boxes.yaw)
-    y_axis = turned(jnp.asarray([0.0, 1.0], dtype=o.dtype), boxes.yaw)
+    x_axis, y_axis = (turned(jnp.asarray(e, dtype=o.dtype), boxes.yaw) for e in ([1.0, 0.0], [0.0, 1.0]))
     local = -turned(o, -boxes.yaw)
-    ahead, behind = boxes.half_size - local, boxes.half_size + local
-    near, far_a, far_b, between = _pair_of_faces(ahead, behind)
+    near, ahead, behind, between = _pair_of_faces(boxes.half_size - local, boxes.half_size + local)
     near_x, near_y = near[:, :1] * x_axis, near[:, 1:] * y_axis
     near_x, near_y = jnp.where(between[:, :1], near_y, near_x), jnp.where(between[:, 1:], near_x, near_y)
     signs = jnp.asarray([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]], dtype=o.dtype)
-    corners = boxes.half_size[:, None, :] * signs
-    seen = o[:, None, :] + corners[..., :1] * x_axis[:, None] + corners[..., 1:] * y_axis[:, None]
-    within = jnp.all(between, axis=-1)
-    left, right = _tangents(o, seen)
+    offsets = boxes.half_size[:, None, :] * signs
+    corners = o[:, None, :] + offsets[..., :1] * x_axis[:, None] + offsets[..., 1:] * y_axis[:, None]
     gap = jnp.maximum(jnp.abs(local) - boxes.half_size, 0.0)
-    one = jnp.ones_like(boxes.yaw)
+    zero = jnp.zeros_like(boxes.yaw)
     return _silhouette(
         boxes,
         eye,
-        within,
-        (left, right),
-        (_norm(gap), jnp.max(_norm(seen), axis=-1)),
+        jnp.all(between, axis=-1),
+        _outermost(o, corners),
+        (_norm(gap), jnp.max(_norm(corners), axis=-1)),
         axis=_xy(x_axis),
         near_x=_xy(near_x),
         near_y=_xy(near_y),
-        far_x=(far_a[:, 0], far_b[:, 0]),
-        far_y=(far_a[:, 1], far_b[:, 1]),
-        round=0.0 * one,
+        far_x=(ahead[:, 0], behind[:, 0]),
+        far_y=(ahead[:, 1], behind[:, 1]),
+        round=zero,
         centre=_xy(o),
-        radius_square=one,
-        polar=(0.0 * one, 0.0 * one),
+        radius_square=zero,
+        polar=(zero, zero),
     )
 
 
-def of_cylinders(cylinders: Prisms, eye: Float[Array, "3"]) -> tuple[Silhouette, Bounds]:
-    """Look at cylinders from an eye."""
-    o = cylinders.centre - eye[:2]
-    radius = cylinders.half_size[:, 0]
-    distance = _norm(o)
+def _of_cylinders(cylinders: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
+    o, radius = cylinders.centre - eye[:2], cylinders.half_size[:, 0]
+    distance = jnp.maximum(_norm(o), NEAR)
     within = distance < radius
     power = _away_from_zero((distance - radius) * (distance + radius))
-    sine = jnp.where(within, 0.5, radius / jnp.where(within, 1.0, jnp.maximum(distance, _NEAR)))
+    sine = jnp.where(within, 0.5, radius / jnp.where(within, 1.0, distance))
     cosine = jnp.sqrt(jnp.maximum(1.0 - sine * sine, 1e-8))
-    unit = o / jnp.maximum(distance, _NEAR)[:, None]
-    normal = jnp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
-    left = unit * sine[:, None] - normal * cosine[:, None]
-    right = unit * sine[:, None] + normal * cosine[:, None]
+    along = o / distance[:, None]
+    aside = jnp.stack([-along[:, 1], along[:, 0]], axis=-1)
+    along, aside = along * sine[:, None], aside * cosine[:, None]
     zero = jnp.zeros_like(radius)
     return _silhouette(
         cylinders,
         eye,
         within,
-        (left, right),
+        (along - aside, along + aside),
         (jnp.maximum(distance - radius, 0.0), distance + radius),
-        axis=(jnp.cos(cylinders.yaw), jnp.sin(cylinders.yaw)),
+        axis=(zero, zero),
         near_x=(zero, zero),
         near_y=(zero, zero),
         far_x=(zero, zero),
@@ -139,61 +185,59 @@ def of_cylinders(cylinders: Prisms, eye: Float[Array, "3"]) -> tuple[Silhouette,
 
 
 def _silhouette(
-    prisms: Prisms, eye: Array, within: Array, tangents: tuple[Array, Array], reach: tuple[Array, Array], **shape
+    prisms: Prisms, eye: Array, within: Array, normals: Pair, reach: Pair, **shape
 ) -> tuple[Silhouette, Bounds]:
     """Fill in what boxes and cylinders have in common."""
     # Nothing is seen under the floor, where padding is parked.
     z_t, z_b = prisms.top - eye[2], jnp.maximum(prisms.bottom, 0.0) - eye[2]
     from_above, from_below = z_t < 0, z_b > 0
+    lidded = from_above | from_below
+    lid_end, other_end = jnp.where(from_below, z_b, z_t), jnp.where(from_below, z_t, z_b)
     sides = jnp.where(within, 0.0, 1.0)[:, None]
-    lid = jnp.where(from_above, 1.0 / _away_from_zero(z_t), jnp.where(from_below, 1.0 / _away_from_zero(z_b), 0.0))
-    unclosed = jnp.where(within, _OPEN, 0.0)
-    left, right = tangents
-    nearest, farthest = reach
     silhouette = Silhouette(
-        left=_xy(left * sides),
-        right=_xy(right * sides),
+        left=_xy(normals[0] * sides),
+        right=_xy(normals[1] * sides),
         open=jnp.where(is_parked(prisms), 0.0, jnp.where(within, 1.0, 0.5)),
-        top=z_t,
-        bottom=z_b,
-        lid=lid,
-        unclosed_top=jnp.where(from_above, 0.0, unclosed),
-        unclosed_bottom=jnp.where(from_below, 0.0, unclosed),
-        within=unclosed,
+        lid_end=lid_end,
+        other_end=other_end,
+        upward=jnp.where(from_below, -1.0, 1.0).astype(lid_end.dtype),
+        lid_open=jnp.where(within & ~lidded, _OPEN, 0.5),
+        other_open=jnp.where(within, _OPEN, 0.5),
+        lid=jnp.where(lidded, 1.0 / _away_from_zero(lid_end), 0.0),
+        lid_bias=jnp.where(lidded, jnp.where(within, _OPEN, 0.0), -_OPEN),
         texture=texture.prepare(prisms.texture),
         **shape,
     )
-    nearest = jnp.maximum(nearest, _NEAR)
+    nearest, farthest = jnp.maximum(reach[0], NEAR), reach[1]
     highest = jnp.arctan2(z_t, jnp.where(from_above, farthest, nearest))
     lowest = jnp.arctan2(z_b, jnp.where(from_below, farthest, nearest))
-    return silhouette, Bounds(nearest=nearest, lowest=lowest, highest=highest)
+    return silhouette, lax.stop_gradient(Bounds(nearest, lowest, highest, within))
 
 
 def _pair_of_faces(ahead: Array, behind: Array) -> tuple[Array, Array, Array, Array]:
-    """1/distance, along an axis, of the near face and of the far ones (twice the same unless the eye is between)."""
+    """1/distance of a pair of faces, along an axis: the near one's, and the far one's for rays along the axis and
+    against it, which are two only if the eye is between."""
     plus, minus = 1.0 / _away_from_zero(ahead), -1.0 / _away_from_zero(behind)
     between = (ahead > 0) & (behind > 0)
     beyond = ahead <= 0
-    near = jnp.where(beyond, plus, minus)
     far = jnp.where(beyond, minus, plus)
-    return near, far, jnp.where(between, minus, far), between
+    return jnp.where(beyond, plus, minus), far, jnp.where(between, minus, far), between
 
 
-def _tangents(o: Array, corners: Float[Array, "n 4 2"]) -> tuple[Array, Array]:
+def _outermost(o: Array, corners: Float[Array, "n 4 2"]) -> Pair:
     """Inward normals of the upright planes through the eye and the outermost corners."""
-    along = jnp.sum(o[:, None] * corners, axis=-1)
+    along = o[:, None, 0] * corners[..., 0] + o[:, None, 1] * corners[..., 1]
     aside = o[:, None, 0] * corners[..., 1] - o[:, None, 1] * corners[..., 0]
-    angle = jnp.arctan2(aside, jax.lax.stop_gradient(jnp.where((aside == 0) & (along == 0), 1.0, along)))
-    angle = jax.lax.stop_gradient(angle)
-    unit = corners / jnp.maximum(_norm(corners), _NEAR)[..., None]
-    l = jnp.take_along_axis(unit, jnp.argmax(angle, axis=1)[:, None, None], axis=1)[:, 0]  # noqa: E741
-    r = jnp.take_along_axis(unit, jnp.argmin(angle, axis=1)[:, None, None], axis=1)[:, 0]
-    return jnp.stack([l[:, 1], -l[:, 0]], axis=-1), jnp.stack([-r[:, 1], r[:, 0]], axis=-1)
+    angle = jnp.arctan2(*lax.stop_gradient((aside, along)))
+    unit = corners / jnp.maximum(_norm(corners), NEAR)[..., None]
+    left = jnp.take_along_axis(unit, jnp.argmax(angle, axis=1)[:, None, None], axis=1)[:, 0]
+    right = jnp.take_along_axis(unit, jnp.argmin(angle, axis=1)[:, None, None], axis=1)[:, 0]
+    return jnp.stack([left[:, 1], -left[:, 0]], axis=-1), jnp.stack([-right[:, 1], right[:, 0]], axis=-1)
 
 
 def _away_from_zero(x: Array) -> Array:
-    """x, with at least the magnitude _NEAR; as a divisor safe in both directions of differentiation."""
-    return jnp.where(jnp.abs(x) < _NEAR, jnp.where(x < 0, -_NEAR, _NEAR), x)
+    """x with at least the magnitude NEAR: a divisor that is safe in both directions of differentiation."""
+    return jnp.where(jnp.abs(x) < NEAR, jnp.where(x < 0, -NEAR, NEAR), x)
 
 
 def _norm(vector: Array) -> Array:
@@ -203,5 +247,5 @@ def _norm(vector: Array) -> Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
-def _xy(vector: Array) -> tuple[Array, Array]:
+def _xy(vector: Array) -> Pair:
     return vector[..., 0], vector[..., 1]

@@ -1,0 +1,242 @@
+"""What covers a pixel: the surfaces in front of it, nearest first, by how much each covers and what grey it has.
+
+Everything here is elementwise over rays, so that XLA makes one vectorised loop of it. Components of vectors are
+arrays of their own for the same reason.
+
+| symbol   | name                                         | unit | where                                          |
+| -------- | -------------------------------------------- | ---- | ---------------------------------------------- |
+| d        | direction of a ray in the world              | 1    |                                                |
+| d_u, d_v | its change from column to column, row to row | 1/px |                                                |
+| s        | surface as inverse depth, 1/t = s . d        | 1/m  | `silhouettes`                                  |
+| m        | margin by which a ray is inside an outline   |      |                                                |
+| w        | width over which a pixel smears an edge      |      | max + min/2 of abs(dm/du), abs(dm/dv)          |
+| a        | part of a pixel that is inside               | 1    | clip(1/2 + m/w, 0, 1), exact if straight along |
+|          |                                              |      | rows or columns, to 0.06 if aslant             |
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from lgmdjax import texture
+from lgmdjax.arena import Arena
+from lgmdjax.silhouettes import NEAR, Pair, Silhouette
+from lgmdjax.texture import Texture, Vector
+
+_FAR = 1.0e3
+"""What is farther away [m] is shaded as if it were here."""
+
+
+class Rays(NamedTuple):
+    """One ray a pixel, and how it turns from pixel to pixel."""
+
+    d: Vector
+    d_u: Vector
+    d_v: Vector
+    level_square: Array
+    """d_x^2 + d_y^2."""
+    across: Pair
+    """(d_x, d_y)/w for upright edges: times a plane's unit normal, the margin in pixels."""
+
+
+class Layer(NamedTuple):
+    """A surface in front of each pixel."""
+
+    nearness: Array
+    """1/t, by which layers are ordered; -1: not there."""
+    cover: Array
+    """a."""
+    s: Vector
+    centre: Pair
+    """Where the texture's origin is, from the eye [m]."""
+    texture: Texture
+
+
+def rays(d: Vector, d_u: Vector, d_v: Vector) -> Rays:
+    """Complete rays given by their directions and how these change."""
+    level_square = d[0] * d[0] + d[1] * d[1] + 1e-12
+    width = _width(d[0] * d_u[1] - d[1] * d_u[0], d[0] * d_v[1] - d[1] * d_v[0])
+    per_pixel = jnp.sqrt(level_square) / width
+    return Rays(d, d_u, d_v, level_square, (d[0] * per_pixel, d[1] * per_pixel))
+
+
+def draw(arena: Arena, eye: Array, pixels: Rays, prisms: list[Silhouette], bands: int) -> Array:
+    """Blend the two nearest layers of every pixel over the mean grey of what the room has behind them."""
+    room = _room(arena, eye, pixels)
+    first, second = room.first, room.second
+    for prism in prisms:
+        first, second = _insert(_prism(prism, pixels), first, second)
+    behind_one = jnp.where(first.nearness > room.first.nearness, room.behind_one, room.behind_none)
+    rest = jnp.where(second.nearness > room.first.nearness, room.behind_two, behind_one)
+    nearer, farther = (_shade(arena.handedness, eye, pixels, layer, bands) for layer in (first, second))
+    return rest + second.cover * (1.0 - first.cover) * (farther - rest) + first.cover * (nearer - rest)
+
+
+def _insert(layer: Layer, first: Layer, second: Layer) -> tuple[Layer, Layer]:
+    """Keep the two nearest of three layers."""
+    is_first, is_second = layer.nearness > first.nearness, layer.nearness > second.nearness
+    runner_up = choose(is_first, first, layer)
+    return choose(is_first, layer, first), choose(is_second, runner_up, second)
+
+
+def _prism(prism: Silhouette, pixels: Rays) -> Layer:
+    """What a prism covers of each pixel, and with which face."""
+    d, (across_x, across_y) = pixels.d, pixels.across
+    left = _clip(prism.left[0] * across_x + prism.left[1] * across_y + prism.open)
+    right = _clip(prism.right[0] * across_x + prism.right[1] * across_y + prism.open)
+    near, far = _sides(prism, pixels)
+    side = _slopes(near, pixels)
+    last = _slopes(choose(prism.lid != 0, far, near), pixels)
+    to_lid = _clip(prism.upward * _rise(prism.lid_end, last, pixels) + prism.lid_open)
+    to_other = _clip(prism.other_open - prism.upward * _rise(prism.other_end, side, pixels))
+    cover = jnp.maximum(left + right - 1.0, 0.0) * jnp.maximum(to_lid + to_other - 1.0, 0.0)
+    on_lid = prism.lid * d[2]
+    by_lid = on_lid < side[0] + prism.lid_bias
+    s = (jnp.where(by_lid, 0.0, near[0]), jnp.where(by_lid, 0.0, near[1]), jnp.where(by_lid, prism.lid, 0.0))
+    nearness = jnp.where(cover > 0, jnp.where(by_lid, on_lid, side[0]), -1.0)
+    return Layer(nearness, cover, s, prism.centre, prism.texture)
+
+
+def _sides(prism: Silhouette, pixels: Rays) -> tuple[Pair, Pair]:
+    """s of the sides by which each ray would enter and leave, were the prism endless upward and downward."""
+    x, y, _ = pixels.d
+    near_x, near_y, (c, s) = prism.near_x, prism.near_y, prism.axis
+    near = choose((near_x[0] - near_y[0]) * x + (near_x[1] - near_y[1]) * y < 0, near_x, near_y)
+    along, aside = c * x + s * y, c * y - s * x
+    far_x, far_y = jnp.where(along > 0, *prism.far_x), jnp.where(aside > 0, *prism.far_y)
+    far = choose(far_x * along > far_y * aside, (far_x * c, far_x * s), (-far_y * s, far_y * c))
+    near_round, far_round = _round_sides(prism, pixels)
+    is_round = prism.round > 0
+    return choose(is_round, near_round, near), choose(is_round, far_round, far)
+
+
+def _round_sides(prism: Silhouette, pixels: Rays) -> tuple[Pair, Pair]:
+    """s of the planes that touch a cylinder where a ray enters and leaves it: o/c +- ((d.o) o/c - d)/q.
+
+    q^2 = (d.o)^2 - c d^2, taken as r^2 d^2 - (o x d)^2, which keeps its digits. Rays that miss get the limb's o/c.
+    """
+    x, y, _ = pixels.d
+    (o_x, o_y), (p_x, p_y) = prism.centre, prism.polar
+    moment = o_x * y - o_y * x
+    q_square = prism.radius_square * pixels.level_square - moment * moment
+    least = 1e-4 * prism.radius_square * pixels.level_square + 1e-12
+    inverse = jnp.where(q_square > least, lax.rsqrt(jnp.maximum(q_square, least)), 0.0)
+    b = o_x * x + o_y * y
+    e_x, e_y = (b * p_x - x) * inverse, (b * p_y - y) * inverse
+    return (p_x + e_x, p_y + e_y), (p_x - e_x, p_y - e_y)
+
+
+def _slopes(s: Pair, pixels: Rays) -> Vector:
+    """1/t on an upright face, and its change from column to column and row to row."""
+    x, y, z = (s[0] * d[0] + s[1] * d[1] for d in (pixels.d, pixels.d_u, pixels.d_v))
+    return x, y, z
+
+
+def _rise(z: Array, slopes: Vector, pixels: Rays) -> Array:
+    """Margin in pixels by which rays pass below the height z on a face: m = z/t - d_z."""
+    m, m_u, m_v = (z * a - d[2] for a, d in zip(slopes, (pixels.d, pixels.d_u, pixels.d_v), strict=True))
+    return m / _width(m_u, m_v)
+
+
+def _width(m_u: Array, m_v: Array) -> Array:
+    m_u, m_v = jnp.abs(m_u), jnp.abs(m_v)
+    return jnp.maximum(m_u, m_v) + 0.5 * jnp.minimum(m_u, m_v) + 1e-9
+
+
+class _Room(NamedTuple):
+    """Walls, floor and sky of every pixel: two layers, and what is behind."""
+
+    first: Layer
+    second: Layer
+    behind_none: Array
+    """Grey behind both layers."""
+    behind_one: Array
+    """Mean grey behind the first one."""
+    behind_two: Array
+    """Mean grey of everything."""
+
+
+def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
+    """Draw the room without obstacles: wall or floor, whichever has more of the pixel, then what it shares it with."""
+    by_x, along_x, along_y = _walls(arena, eye, pixels.d)
+    wall_s, other_s = choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)
+    slopes = _slopes(wall_s, pixels)
+    part = _part_of_nearer(wall_s, other_s, pixels)
+    floor = _clip(0.5 + _rise(-eye[2], slopes, pixels))
+    sky = _clip(0.5 - _rise(arena.wall_height - eye[2], slopes, pixels))
+    wall = jnp.maximum(1.0 - floor - sky, 0.0)
+
+    rows = texture.prepare(arena.wall_texture)
+    x_row, y_row = (choose(pixels.d[i] > 0, _row(rows, 2 * i + 1), _row(rows, 2 * i)) for i in (0, 1))
+    wall_row, other_row = choose(by_x, x_row, y_row), choose(by_x, y_row, x_row)
+    floor_row = texture.prepare(arena.floor_texture)
+    floor_first = floor > 0.5
+    # The floor hides nothing that stands in the room.
+    nearness = jnp.where(floor_first, 0.0, slopes[0])
+    on_edge = floor > 0
+
+    def layer(cover: Array, s: Vector, row: Texture) -> Layer:
+        return Layer(nearness, cover, s, (-eye[0], -eye[1]), row)
+
+    zero = jnp.zeros_like(part)
+    as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / jnp.maximum(eye[2], NEAR)), floor_row)
+    as_wall = layer(jnp.where(floor_first, 1.0, jnp.where(on_edge, wall, wall * part)), (*wall_s, zero), wall_row)
+    as_other = layer(wall * (1.0 - part) / jnp.maximum(1.0 - wall * part, 1e-3), (*other_s, zero), other_row)
+    mean = floor * floor_row.brightness + wall * wall_row.brightness + sky * arena.sky
+    beside = jnp.where(on_edge, floor_row.brightness, jnp.where(sky > 0, arena.sky, other_row.brightness))
+    return _Room(
+        first=choose(floor_first, as_floor, as_wall),
+        second=choose(floor_first, as_wall, choose(on_edge, as_floor, as_other)),
+        behind_none=arena.sky,
+        behind_one=jnp.where(floor_first, wall_row.brightness, beside),
+        behind_two=mean,
+    )
+
+
+def _walls(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
+    """Tell whether a wall in x is met before one in y, and s of both."""
+    low, high = eye[:2] - arena.room[0::2], arena.room[1::2] - eye[:2]
+    forth, back = 1.0 / jnp.maximum(high, NEAR), -1.0 / jnp.maximum(low, NEAR)
+    s_x, s_y = jnp.where(d[0] > 0, forth[0], back[0]), jnp.where(d[1] > 0, forth[1], back[1])
+    zero = jnp.zeros_like(s_x)
+    return s_x * d[0] > s_y * d[1], (s_x, zero), (zero, s_y)
+
+
+def _part_of_nearer(wall: Pair, other: Pair, pixels: Rays) -> Array:
+    """Part of a pixel that the nearer of two walls has, the rest being beyond the upright edge between them."""
+    m, m_u, m_v = _slopes((wall[0] - other[0], wall[1] - other[1]), pixels)
+    return _clip(0.5 + m / _width(m_u, m_v))
+
+
+def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int) -> Array:
+    """Grey of a layer where the rays meet it, averaged over the pixel."""
+    d, s = pixels.d, layer.s
+    t = 1.0 / jnp.maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR)
+    scaled = t * layer.texture.frequency
+
+    def step(change: Vector) -> Vector:
+        # The hit moves aside with the ray, and along it by the slant of the surface.
+        slant = (s[0] * change[0] + s[1] * change[1] + s[2] * change[2]) * t
+        x, y, z = (scaled * (change[i] - d[i] * slant) for i in range(3))
+        return x, y * handedness, z
+
+    centre_x, centre_y = layer.centre
+    f = layer.texture.frequency
+    point = (d[0] * t - centre_x) * f, (d[1] * t - centre_y) * f * handedness, (d[2] * t + eye[2]) * f
+    return texture.grey(layer.texture, point, step(pixels.d_u), step(pixels.d_v), bands)
+
+
+def choose(condition: Array, a, b):
+    """`where` over tuples of arrays."""
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
+def _row(rows: Texture, i: int) -> Texture:
+    return jax.tree.map(lambda a: a[i], rows)
+
+
+def _clip(x: Array) -> Array:
+    return jnp.clip(x, 0.0, 1.0)
