@@ -1,0 +1,240 @@
+"""A run folder as the stages leave it, with made-up but plausible numbers."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from lgmdjax import arena
+
+FRAME_RATE = 30.0
+DRIVERS = ("teacher", "learned", "blind", "direct", "random")
+RATES = {"teacher": 0.4, "learned": 3.21, "blind": 17.3, "direct": 12.9, "random": 19.8}
+PERIOD = 1.0
+
+
+def room() -> arena.Arena:
+    """A small room with three boxes, one of them hanging overhead, and two cylinders."""
+    return arena.empty_room(
+        (8.0, 8.0),
+        boxes=arena.place(
+            [[2.0, 1.0], [-1.5, -2.0], [0.5, -1.5]],
+            [[0.3, 0.5], [0.4, 0.4], [0.8, 0.3]],
+            [0.8, 0.6, 0.9],
+            yaw=[0.4, 0.0, 0.2],
+            bottom=[0.0, 0.0, 0.7],
+            texture=[[150.0, 0.7, 0.3, 0.4], [90.0, 0.6, 1.0, 0.5], [120.0, 0.5, 2.0, 0.6]],
+        ),
+        cylinders=arena.place(
+            [[-2.0, 1.5], [1.0, -2.8]], [[0.2, 0.2], [0.15, 0.15]], [1.0, 1.4], texture=(60.0, 0.8, 0.5, 0.3)
+        ),
+        start=(0.0, 2.5, 0.0),
+    )
+
+
+def walks(generator: np.random.Generator, robots: int, frames: int) -> dict[str, np.ndarray]:
+    """Wandering paths of 0.06 m/s from (0, 2.5), set back once, halfway, after a touch by robot 0."""
+    turning = np.cumsum(generator.normal(0, 0.02, (robots, frames)), axis=1)
+    yaw = np.cumsum(0.3 * np.tanh(turning) / FRAME_RATE, axis=1)
+    steps = 0.06 / FRAME_RATE * np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1)
+    positions = np.array([0.0, 2.5, 0.1]) + np.cumsum(steps, axis=1)
+    half = frames // 2
+    setbacks, contact = np.zeros((robots, frames), int), np.zeros((robots, frames), bool)
+    setbacks[0, half:], contact[0, half - 1] = 1, True
+    positions[0, half:] += np.array([-1.0, -3.0, 0.0])
+    return {"": positions, "_setbacks": setbacks, "_contact": contact}
+
+
+def score(rate: float) -> dict:
+    """A score as `trials.score` gives it, as JSON."""
+
+    def estimate(value: float) -> dict[str, float]:
+        return {"value": value, "low": 0.7 * value, "high": 1.4 * value}
+
+    return {
+        "robots": 5,
+        "lost": 0,
+        "distance": 235.3,
+        "collisions": round(rate * 2.353),
+        "per_100_m": estimate(rate),
+        "first_collision": estimate(100 / (rate + 0.1)),
+        "clearance": estimate(0.31),
+        "speed": 0.0587,
+        "turning": 0.113,
+    }
+
+
+def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (240, 320)) -> Path:
+    """Write every file that the report reads; give the folder."""
+    generator = np.random.default_rng(7)
+    for name in ("gait", "collect", "train", "evaluate"):
+        (folder / name).mkdir(parents=True)
+        _json(folder / name / "done.json", {"seconds": 12.5, "device": "cpu, 2 cores"})
+    versions = {"python": "3.11.9", "lgmdjax": "0.1.0", "jax": "0.9.2", "mujoco": "3.17.0"}
+    settings = {
+        "collect": {"robots": 16, "seconds": 120, "width": 160, "height": 120},
+        "train": {"epochs": 40},
+    }
+    _json(
+        folder / "run.json",
+        {"format": 1, "scale": "quick", "seed": 4711, "settings": settings, "versions": versions},
+    )
+    _write_gait(folder / "gait", generator)
+    _write_collect(folder / "collect", generator)
+    _write_train(folder / "train", generator)
+    _write_evaluate(folder / "evaluate", generator, frames, pixels)
+    return folder
+
+
+def _json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content))
+
+
+def _write_gait(folder: Path, generator: np.random.Generator) -> None:
+    time = np.arange(0, 8, 1 / 180)
+    settled = 1 - np.exp(-time / 1.2)
+    phase = 2 * np.pi * time / PERIOD
+    start = generator.uniform(0, 2 * np.pi, 6)
+    rhythm = [
+        0.57 * np.sin(phase + np.pi * (leg % 2) + start[leg] * (1 - settled)) * settled for leg in range(6)
+    ]
+    np.savez(folder / "cpg.npz", time=time, rhythm=np.stack(rhythm, 1), transient_cycles=3.1, period=PERIOD)
+    loop = np.linspace(0, 2 * np.pi, 180)
+    v = np.array([0.5, 1.0, 2.0])
+    asked = np.stack(
+        [
+            0.2 + 0.0125 * v[:, None] * np.cos(loop),
+            np.full((3, 180), 0.16),
+            -0.10 + 0.03 * np.maximum(np.sin(loop), 0) + 0 * v[:, None],
+        ],
+        -1,
+    )
+    literal = np.stack([0.2 + 0.02 * np.cos(loop), np.full(180, 0.16), -0.10 + 0.01 * (1 + np.cos(loop))], -1)
+    np.savez(
+        folder / "foot.npz",
+        velocities=v,
+        commanded=asked,
+        literal=literal,
+        simulated=asked + generator.normal(0, 3e-4, asked.shape),
+    )
+    sweep = []
+    for left, right in ((-1, -1), (0.5, 0.5), (1, 1), (1.2, 1.2), (2, 2), (-1, 1), (1, -1), (0.5, 1.5)):
+        speed, turn = 0.025 * (left + right), 0.065 * (right - left)
+        sweep.append(
+            {
+                "velocity": [left, right],
+                "asked": speed,
+                "mjx": 0.98 * speed,
+                "c": 0.975 * speed,
+                "yaw_rate_mjx": turn,
+                "yaw_rate_c": 1.01 * turn,
+                "drift_deg": 1.7,
+            }
+        )
+    _json(
+        folder / "gait.json",
+        {
+            "cycle_time": PERIOD,
+            "sweep": sweep,
+            "literal": {"mjx": 0.0071, "c": 0.0069},
+            "sway": {"pitch_deg": 0.8, "roll_deg": 1.1, "yaw_deg": 0.9, "bounce_mm": 1.4},
+        },
+    )
+
+
+def _write_collect(folder: Path, generator: np.random.Generator) -> None:
+    table = [
+        {
+            "threshold": t,
+            "suppression": 20.0,
+            "inhibition": w,
+            "overlap": 0.6,
+            "score": 0.7 - 0.02 * (t - 6 * w - 3) ** 2,
+        }
+        for w in (0.3, 0.4)
+        for t in (1.0, 2.0, 4.0, 6.0, 8.0)
+    ]
+    best = max(table, key=lambda row: row["score"])
+    _json(folder / "calibration.json", {**best, "table": table})
+    np.savez(folder / "rooms.npz", positions=walks(generator, 4, 900)[""][..., :2])
+
+
+def _write_train(folder: Path, generator: np.random.Generator) -> None:
+    epochs = np.arange(40)
+    curves, table = {}, []
+    for name, floor in (("lstm", 0.20), ("lstm_command", 0.15), ("feed_forward", 0.42)):
+        train = floor + np.exp(-epochs / 8) * np.exp(generator.normal(0, 0.03, 40))
+        curves[name] = {"train": train.tolist(), "test": (train * 1.2 + 0.02).tolist()}
+        table.append(
+            {
+                "variant": name,
+                "train_mse": train[-1],
+                "test_mse": curves[name]["test"][-1],
+                "unseen_mse": 1.3 * train[-1],
+                "r2": [0.61, 0.58],
+                "unseen_r2": [0.52, 0.49],
+            }
+        )
+    table.append(
+        {
+            "variant": "mean",
+            "train_mse": 1.0,
+            "test_mse": 1.1,
+            "unseen_mse": 1.2,
+            "r2": [0.0, -0.01],
+            "unseen_r2": [-0.02, -0.03],
+        }
+    )
+    _json(folder / "training.json", {"curves": curves, "table": table})
+    time = np.arange(900) / FRAME_RATE
+    distances = np.clip(np.stack([2.2 + 2 * np.sin(time / 4), 2.2 + 2 * np.cos(time / 5)], 1), 0.3, 5)
+    label = np.clip(1.2 + 0.8 / distances - 0.6 / distances[:, ::-1], -1, 2)
+    np.savez(
+        folder / "prediction.npz",
+        time=time,
+        distances=distances,
+        label=label,
+        u=0.5 + 0.3 / distances / 2 + np.abs(generator.normal(0, 0.02, (900, 2))),
+        predicted=label + generator.normal(0, 0.08, label.shape),
+    )
+
+
+def _write_evaluate(
+    folder: Path, generator: np.random.Generator, frames: int, pixels: tuple[int, int]
+) -> None:
+    scores = {name: score(rate) for name, rate in RATES.items()}
+    _json(
+        folder / "evaluation.json",
+        {"testing": scores, "unseen": {name: score(1.1 * r) for name, r in RATES.items()}},
+    )
+    paths = {
+        f"testing_{name}{key}": value
+        for name in DRIVERS
+        for key, value in walks(generator, 5, frames).items()
+    }
+    unseen = {f"unseen_learned{key}": value for key, value in walks(generator, 4, frames).items()}
+    np.savez(folder / "trajectories.npz", allow_pickle=False, **paths, **unseen)
+    rows, columns = np.mgrid[: pixels[0], : pixels[1]]
+    picture = 127 + 90 * np.sin(columns / 11) * np.sin(rows / 17)
+    change = np.abs(90 * np.cos(columns / 11) * np.sin(rows / 17)) * (columns > pixels[1] // 2) / 6
+    np.savez(
+        folder / "layers.npz", picture=picture, E=change, I=2 * change, S=change - 0.8 * np.roll(change, 2, 1)
+    )
+    path = walks(generator, 1, frames)[""][0] + np.array([0, -1.5, 0])
+    heading = np.arctan2(*np.gradient(path[:, 1::-1], axis=0).T)
+    time = np.arange(frames) / FRAME_RATE
+    stance = np.tile([[0.0, 0.65, -0.38]], (6, 1))
+    swing = 0.2 * np.sin(2 * np.pi * time[:, None] + np.pi * (np.arange(6) % 2))
+    joints = stance + swing[..., None] * np.array([1.0, 0.5, 0.0])
+    distances = np.clip(np.stack([2.2 + 2 * np.sin(time / 4), 2.2 + 2 * np.cos(time / 5)], 1), 0.3, 5)
+    np.savez(
+        folder / "walk.npz",
+        time=time,
+        position=path,
+        joints=joints,
+        distances=distances,
+        quaternion=np.stack([np.cos(heading / 2), 0 * heading, 0 * heading, np.sin(heading / 2)], -1),
+        u=0.5 + 0.15 / distances,
+        velocity=1.2 + 0.8 / distances - 0.6 / distances[:, ::-1],
+        contact=np.zeros(frames, bool),
+    )
