@@ -8,9 +8,9 @@ import io
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -78,6 +78,45 @@ def doctor(*, out: Path = Path("runs")) -> int:
     return examine(out)
 
 
+def watch(
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="video")],
+    *,
+    stereo: Literal["side-by-side"] | None = None,
+    mono: tyro.conf.FlagCreatePairsOff[bool] = False,
+    out: Path = Path("runs/watch"),
+    table: Literal["csv", "parquet"] = "csv",
+    overlap: float = 0.5,
+    width: int = 320,
+    threshold: float | None = None,
+    suppression: float | None = None,
+    inhibition: float | None = None,
+) -> None:
+    """Run the two collision detectors on a video; leave u and FF of each frame, a plot and an overlay video.
+
+    Args:
+        path: the video; anything that FFmpeg reads
+        stereo: each frame holds the left and the right eye's picture, side by side
+        mono: each frame is one picture, and each eye looks at its side of it (so it is without --stereo)
+        out: the results go into a folder of the video's name in here
+        table: format of the numbers, one row a frame
+        overlap: fraction of its picture that each eye looks at, 0.5 (its half) to 1 (all of it)
+        width: pictures that are wider are averaged down to this [px]
+        threshold: T_s, the change that a cell must exceed [grey levels of 255]
+        suppression: T_f, the mean change over the picture at which the detector is silenced [grey levels]
+        inhibition: W_I, weight of the inhibition
+    """
+    from lgmdjax import lgmd
+    from lgmdjax import watch as watching
+
+    if mono and stereo is not None:
+        raise InputError("expected --mono or --stereo, got both; leave one out")
+    chosen = {"threshold": threshold, "suppression": suppression, "inhibition": inhibition}
+    params = replace(lgmd.Params(), **{name: value for name, value in chosen.items() if value is not None})
+    eyes = watching.Eyes(stereo=stereo is not None, overlap=overlap, width=width)
+    for file in watching.watch(path, out, eyes=eyes, params=params, table=table):
+        print(file)
+
+
 COMMANDS: dict[str, Callable[..., int | None]] = {
     "reproduce": reproduce,
     "fit-gait": fit_gait,
@@ -85,6 +124,7 @@ COMMANDS: dict[str, Callable[..., int | None]] = {
     "train": train,
     "evaluate": evaluate,
     "report": report,
+    "watch": watch,
     "doctor": doctor,
 }
 
