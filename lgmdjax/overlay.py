@@ -105,10 +105,12 @@ def _paint(colours: ndarray, mask: ndarray, colour: ndarray, brightness: ndarray
 
 def _write(pen: ImageDraw.ImageDraw, sheet: Sheet, course: Sequence[Moment]) -> None:
     """Write down the newest moment, and draw the last ones up to it."""
-    now, left, right = course[-1], sheet.strip[0], sheet.strip[2]
-    u, FF = ("{:.{}f} | {:.{}f}".format(a, n, b, n) for (a, b), n in ((now.u, 2), (now.feed_forward, 1)))
-    text = f"{now.time:7.2f} s     u  {u}     FF  {FF}"
-    pen.text((left, sheet.strip[1] - LINE), text, fill=INK, font=ImageFont.load_default(13))
+    now, (left, top, right, _) = course[-1], sheet.strip
+    font = ImageFont.load_default(13)
+    pen.text((left, top - LINE), f"{now.time:.2f} s", fill=INK, font=font)
+    for side, (name, colour) in enumerate(zip(("left", "right"), EYES, strict=True)):
+        text = f"{name} eye: u {now.u[side]:.2f}, FF {now.feed_forward[side]:.1f}"
+        pen.text((left + 80 + 180 * side, top - LINE), text, fill=colour, font=font)
     shown = course[-SPAN:]
     for side, colour in enumerate(EYES):
         points = [
