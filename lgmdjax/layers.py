@@ -59,7 +59,7 @@ def rays(d: Vector, d_u: Vector, d_v: Vector) -> Rays:
     """Complete rays given by their directions and how these change."""
     level_square = d[0] * d[0] + d[1] * d[1] + 1e-12
     width = _width(d[0] * d_u[1] - d[1] * d_u[0], d[0] * d_v[1] - d[1] * d_v[0])
-    per_pixel = jnp.sqrt(level_square) / width
+    per_pixel = _once(jnp.sqrt(level_square) / width)
     return Rays(d, d_u, d_v, level_square, (d[0] * per_pixel, d[1] * per_pixel))
 
 
@@ -214,7 +214,7 @@ def _part_of_nearer(wall: Pair, other: Pair, pixels: Rays) -> Array:
 def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int) -> Array:
     """Grey of a layer where the rays meet it, averaged over the pixel."""
     d, s = pixels.d, layer.s
-    t = 1.0 / jnp.maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR)
+    t = _once(1.0 / jnp.maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
     scaled = t * layer.texture.frequency
 
     def step(change: Vector) -> Vector:
@@ -227,6 +227,12 @@ def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int
     f = layer.texture.frequency
     point = (d[0] * t - centre_x) * f, (d[1] * t - centre_y) * f * handedness, (d[2] * t + eye[2]) * f
     return texture.grey(layer.texture, point, step(pixels.d_u), step(pixels.d_v), bands)
+
+
+def _once(quotient: Array) -> Array:
+    """Give a division a single user, a bound that is never reached: XLA would not fuse it into several, nor anything
+    before it, and write them all to memory."""
+    return jnp.minimum(quotient, 1e30)
 
 
 def choose(condition: Array, a, b):
