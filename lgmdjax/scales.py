@@ -14,19 +14,30 @@ Scale = Literal["smoke", "quick", "paper"]
 
 @dataclass(frozen=True, kw_only=True)
 class FitGait:
-    """The shaping networks, taught the regular tripod gait."""
+    """The shaping networks, taught the regular tripod gait, and walked at set velocities."""
 
     steps: int
+    seconds: float  # of each measured walk
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eyes:
+    """Pictures of width x height pixels an eye, of which each LGMD gets the part `overlap` on its side."""
+
+    width: int
+    height: int
+    overlap: float = 0.6
 
 
 @dataclass(frozen=True, kw_only=True)
 class Collect:
-    """Walks of the teacher, each robot in a room of its own; pictures of width x height pixels an eye."""
+    """Walks of the teacher: as many robots at once, each in a room of its own, and new rooms for every episode."""
 
+    eyes: Eyes
     robots: int
-    seconds: float  # of each robot
-    width: int
-    height: int
+    episodes: int
+    seconds: float  # of each robot in an episode
+    calibration_seconds: float  # of each robot, walked before to choose the thresholds on
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,21 +65,21 @@ class Report:
 
 SCALES: Mapping[Scale, Mapping[str, Any]] = {
     "smoke": {
-        "fit-gait": FitGait(steps=200),
+        "fit-gait": FitGait(steps=200, seconds=6),
         "collect": Collect(robots=2, seconds=10, width=80, height=60),
         "train": Train(epochs=5),
         "evaluate": Evaluate(rooms=2, seconds=5, metres=0.5),
         "report": Report(video_seconds=2),
     },
     "quick": {
-        "fit-gait": FitGait(steps=2000),
+        "fit-gait": FitGait(steps=3000, seconds=20),
         "collect": Collect(robots=16, seconds=120, width=160, height=120),
         "train": Train(epochs=200),
         "evaluate": Evaluate(rooms=16, seconds=60, metres=20),
         "report": Report(video_seconds=15),
     },
     "paper": {
-        "fit-gait": FitGait(steps=5000),
+        "fit-gait": FitGait(steps=4500, seconds=20),
         "collect": Collect(robots=16, seconds=900, width=320, height=240),
         "train": Train(epochs=1000),
         "evaluate": Evaluate(rooms=64, seconds=180, metres=235.3),

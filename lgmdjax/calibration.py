@@ -1,0 +1,125 @@
+"""Choose the LGMD's thresholds on recorded walks: T_s by what it tells of distance, T_f by what walking looks like.
+
+T_s "has to be set experimentally" (paper sec. 3.3). Here the pictures of a recorded walk are drawn again, and the
+detector is run with many thresholds at once. The best one is that whose left-right difference of log U, averaged over
+about a gait cycle, follows the difference of nearness best while the robot walks straight: steering is a matter of
+which side is nearer, and a turn floods both eyes whatever the threshold. T_f then lies above the FF of nearly all
+straight walking, so that only fast camera motion is cut, and no eye is cut for being near something.
+
+| symbol      | name                    | unit |
+| ----------- | ----------------------- | ---- |
+| T_s         | threshold               | grey |
+| T_f         | suppression             | grey |
+| U / n_cell  | excitation              | grey |
+| FF          | feed_forward            | grey |
+| 1/d         | nearness                | 1/m  |
+
+Source: Cizek & Faigl, eqs. 12-16 and sec. 3.3; the statistic is our own.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+from scipy import ndimage
+
+from lgmdjax import arena, camera, hexapod, lgmd
+from lgmdjax.errors import InputError
+from lgmdjax.simulation import FRAME_RATE, Record
+
+THRESHOLDS = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # candidates for T_s, grey
+AVERAGED = 0.8  # s, about a gait cycle
+STRAIGHT = 0.5  # |v_r - v_l| up to which a walk is straight, nominal
+FASTEST_WALKING = 0.995  # share of straight walking that T_f lets pass
+FLOOR = 1e-3  # grey, added to U before its logarithm
+
+
+@struct.dataclass(kw_only=True)
+class Choice:
+    """The thresholds chosen, and how all candidates did."""
+
+    threshold: float
+    suppression: float
+    table: list[dict[str, float]]
+
+
+@partial(jax.jit, static_argnames="eyes")
+def survey(
+    params: lgmd.Params,
+    eyes: camera.Params,
+    arenas: arena.Arena,
+    positions: Float[Array, "robots frames 3"],
+    quaternions: Float[Array, "robots frames 4"],
+    thresholds: Float[Array, "candidates"],
+) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
+    """Draw what recorded walks saw once more, and return U / n_cell for every threshold, and FF, of both eyes."""
+
+    def look(position: Array, quaternion: Array, room: arena.Arena) -> Array:
+        pose = hexapod.Pose(position=position, quaternion=quaternion)
+        return camera.render(eyes, room, *hexapod.eye_poses(pose))
+
+    def walk(room: arena.Arena, positions: Array, quaternions: Array):
+        def frame(state: lgmd.State, pose: tuple[Array, Array]):
+            step = jax.vmap(lgmd.excitations, in_axes=(None, 0, 0, None))
+            state, response = step(params, state, look(*pose, room), thresholds)
+            return state, (response.excitation, response.feed_forward)
+
+        opened = jax.vmap(lgmd.init, in_axes=(None, 0))(params, look(positions[0], quaternions[0], room))
+        return jax.lax.scan(frame, opened, (positions, quaternions))[1]
+
+    return jax.vmap(walk)(arenas, positions, quaternions)
+
+
+def choose(record: Record, excitation: np.ndarray, feed_forward: np.ndarray, thresholds: np.ndarray) -> Choice:
+    """Choose T_s and T_f from a survey of recorded walks.
+
+    Args:
+        record: the walks, axes (robot, frame).
+        excitation: U / n_cell, (robots, frames, 2, candidates) [grey].
+        feed_forward: FF, (robots, frames, 2) [grey].
+        thresholds: the candidates [grey].
+
+    Raises InputError when there is too little straight walking to tell.
+    """
+    straight = _straight(record)
+    if straight.sum() < 10 * FRAME_RATE:
+        raise InputError(
+            f"calibration: expected 10 s or more of straight walking, got {straight.sum() / FRAME_RATE:.1f} s; "
+            "record longer walks, or more robots"
+        )
+    nearness = 1 / np.asarray(record.distances)
+    averaged = ndimage.uniform_filter1d(np.asarray(excitation), round(AVERAGED * FRAME_RATE), axis=1)
+    table = [
+        {"threshold": float(threshold), **_agreement(np.log(averaged[..., k] + FLOOR)[straight], nearness[straight]),
+         "median_excitation": float(np.median(excitation[straight][..., k]))}
+        for k, threshold in enumerate(thresholds)
+    ]  # fmt: skip
+    best = max(table, key=lambda row: row["score"])
+    suppression = float(np.quantile(np.asarray(feed_forward)[straight], FASTEST_WALKING))
+    return Choice(threshold=best["threshold"], suppression=suppression, table=table)
+
+
+def _straight(record: Record) -> np.ndarray:
+    """Tell which frames are straight walking that has lasted long enough for the average to be of nothing else."""
+    velocity = np.asarray(record.velocity)
+    sound = np.asarray(record.ok) & ~np.asarray(record.contact) & ~np.asarray(record.fresh)
+    steady = sound & (np.abs(velocity[..., 1] - velocity[..., 0]) < STRAIGHT)
+    window = round(AVERAGED * FRAME_RATE)
+    # The average is centred; two windows leave a margin for the pictures of the put-down on either side.
+    return ndimage.minimum_filter1d(steady.astype(np.uint8), 2 * window + 1, axis=1, mode="constant").astype(bool)
+
+
+def _agreement(level: Float[np.ndarray, "frames 2"], nearness: Float[np.ndarray, "frames 2"]) -> dict[str, float]:
+    """Correlate log U with 1/d on either side, and the differences of the sides, which is the score."""
+
+    def correlation(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0 and np.ptp(b) > 0 else 0.0
+
+    return {
+        "score": correlation(level[:, 0] - level[:, 1], nearness[:, 0] - nearness[:, 1]),
+        "left": correlation(level[:, 0], nearness[:, 0]),
+        "right": correlation(level[:, 1], nearness[:, 1]),
+    }

@@ -1,0 +1,116 @@
+"""Many frames, many robots: the one place that scans, maps and jits a walk.
+
+`walk` is a `lax.scan` of `simulation.step`; `Crowd` runs it for a batch of rooms in chunks of a few seconds of
+robot time, so that a host can show progress, write what came, and be interrupted between two chunks.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+from mujoco import mjx
+
+from lgmdjax import scenes, simulation
+from lgmdjax.arena import Arena, free_poses
+from lgmdjax.drivers import Driver
+from lgmdjax.simulation import Params, Record, Room, State
+
+
+def walk(
+    params: Params,
+    model: mjx.Model,
+    room: Room,
+    state: State,
+    driver: Driver,
+    frames: int,
+    draw: Bool[Array, ""] | bool = True,
+) -> tuple[State, Record]:
+    """Walk one robot for a static number of frames; the record has a leading axis of frames."""
+
+    def frame(state: State, _: None) -> tuple[State, Record]:
+        return simulation.step(params, model, room, state, driver, draw)
+
+    return jax.lax.scan(frame, state, length=frames)
+
+
+@partial(jax.jit, static_argnames="driver")
+def start(params: Params, model: mjx.Model, rooms: Room, *, driver: Driver) -> State:
+    """Put one robot into each room of a batch."""
+    return jax.vmap(lambda room: simulation.init(params, model, room, driver))(rooms)
+
+
+@partial(jax.jit, static_argnames=("driver", "frames"), donate_argnames="states")
+def advance(
+    params: Params, model: mjx.Model, rooms: Room, states: State, *, driver: Driver, frames: int, draw: Bool[Array, ""] | bool
+) -> tuple[State, Record]:
+    """Walk a batch of robots, each in its own room; the record's axes are (robot, frame)."""
+    one = lambda room, state: walk(params, model, room, state, driver, frames, draw)  # noqa: E731
+    return jax.vmap(one)(rooms, states)
+
+
+def chunks(
+    params: Params,
+    model: mjx.Model,
+    rooms: Room,
+    driver: Driver,
+    seconds: float,
+    *,
+    draw: bool = True,
+    chunk_seconds: float = 5.0,
+) -> Iterator[Record]:
+    """Walk a batch of robots for `seconds`, yielding host records of `chunk_seconds` as they come.
+
+    One program is compiled for all chunks: the last one may walk on past the end, and is cut.
+    """
+    frames = max(1, round(chunk_seconds * simulation.FRAME_RATE))
+    total = round(seconds * simulation.FRAME_RATE)
+    states = start(params, model, rooms, driver=driver)
+    for done in range(0, total, frames):
+        states, record = advance(params, model, rooms, states, driver=driver, frames=frames, draw=draw)
+        yield jax.tree.map(lambda leaf: np.asarray(leaf)[:, : total - done], record)
+
+
+def together(records: list[Record]) -> Record:
+    """Join the chunks of one walk along their frames."""
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *records)
+
+
+STARTS = 32  # places where a room's robot is put down, one after the other
+
+
+@partial(jax.jit, static_argnames="count")
+def random_rooms(key: Array, count: int, density: float = 0.25) -> Room:
+    """Draw rooms that a key alone decides, each with its starts; the same key and index give the same room."""
+
+    def room(key: Array) -> Room:
+        arena_key, starts_key, luck = jax.random.split(key, 3)
+        arena = scenes.random_room(arena_key, density)
+        return Room(arena=arena, starts=free_poses(starts_key, arena, STARTS), key=luck)
+
+    return jax.vmap(lambda index: room(jax.random.fold_in(key, index)))(jnp.arange(count))
+
+
+@partial(jax.jit, static_argnames="count")
+def copies(key: Array, arena: Arena, count: int, spread: float = jnp.pi) -> Room:
+    """Give every robot of a crowd the same room: first its own start, turned by up to `spread`, then free ones."""
+
+    def room(key: Array) -> Room:
+        turn_key, starts_key, luck = jax.random.split(key, 3)
+        turn = jnp.asarray([0, 0, 1]) * jax.random.uniform(turn_key, minval=-spread, maxval=spread)
+        later = free_poses(starts_key, arena, STARTS - 1)
+        return Room(arena=arena, starts=jnp.concatenate([(arena.start + turn)[None], later]), key=luck)
+
+    return jax.vmap(lambda index: room(jax.random.fold_in(key, index)))(jnp.arange(count))
+
+
+def stack(rooms: list[Room]) -> Room:
+    """Batch rooms of one padding, so that every robot has its own."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
+
+
+def join(first: Room, second: Room) -> Room:
+    """Put two batches of rooms together."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)

@@ -1,0 +1,216 @@
+"""One robot, one camera frame: sense, decide, move.
+
+A frame draws what both eyes see from where the robot stands, scans with the laser, shows the pictures to the
+LGMDs, lets the driver choose a velocity and the rule label the frame, and then runs the rhythm, the servos and
+the body for the physics substeps of 1/30 s. Everything is a pure function of (parameters, room, state): a walk
+is a `lax.scan` over `step`, a crowd a `vmap` of it (`lgmdjax.rollout`).
+
+A touch of a wall or an obstacle ends a stretch: the next frame begins with the robot set back at the room's next
+start, as an experimenter would lift it, so that one walk can count several collisions. A robot whose state is
+not finite, or that fell over, is frozen where it was and flagged by `ok`; nothing here raises.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+from mujoco import mjx
+
+from lgmdjax import arena, braitenberg, camera, controller, hexapod, laser, lgmd
+from lgmdjax.drivers import Driver, Senses
+
+FRAME_RATE = 30.0  # Hz, the camera's (paper sec. 3.1)
+SUBSTEPS = 6  # physics steps a frame; the robot's XML has the time step that makes them fill it
+
+
+@struct.dataclass(kw_only=True)
+class Params:
+    """What a robot is made of, beside its body: senses, nervous system, and the rule that labels its frames."""
+
+    controller: controller.Params
+    teacher: braitenberg.Params
+    camera: camera.Params
+    laser: laser.Params
+
+
+@struct.dataclass(kw_only=True)
+class Room:
+    """Where a robot walks: the obstacles, and the poses (x, y, yaw) at which it is put down, in order."""
+
+    arena: arena.Arena
+    starts: Float[Array, "starts 3"]
+    key: Array  # the luck of a driver that has some
+
+
+@struct.dataclass(kw_only=True)
+class State:
+    """One robot in one room between two frames."""
+
+    data: mjx.Data
+    controller: controller.State
+    teacher: braitenberg.State
+    frame: Int[Array, ""]  # frames since the start
+    setbacks: Int[Array, ""]  # times that it was put down again
+    fresh: Bool[Array, ""]  # just put down: the eyes have no last picture yet
+    touched: Bool[Array, ""]  # hit something in the last frame
+    ok: Bool[Array, ""]  # finite and on its feet
+
+
+@struct.dataclass(kw_only=True)
+class Record:
+    """What one frame leaves behind; the pose is the one from which the pictures were drawn."""
+
+    time: Float[Array, ""]  # s
+    position: Float[Array, "3"]  # m
+    quaternion: Float[Array, "4"]  # w x y z
+    joints: Float[Array, "6 3"]  # rad
+    u: Float[Array, "2"]
+    feed_forward: Float[Array, "2"]  # grey
+    excitation: Float[Array, "2"]  # grey, U / n_cell
+    distances: Float[Array, "2"]  # m
+    label: Float[Array, "2"]  # the teacher's velocity
+    velocity: Float[Array, "2"]  # the driver's velocity
+    clearance: Float[Array, ""]  # m, the least within the frame
+    contact: Bool[Array, ""]  # clearance <= 0 in some substep
+    fresh: Bool[Array, ""]
+    setbacks: Int[Array, ""]
+    ok: Bool[Array, ""]
+
+
+def init(params: Params, model: mjx.Model, room: Room, driver: Driver) -> State:
+    """Put a robot down at the room's first start, with its rhythm settled and its eyes about to open."""
+    dark = jnp.zeros(camera.shape(params.camera))
+    return State(
+        data=hexapod.reset(model, room.starts[0]),
+        controller=controller.init(params.controller, dark, driver, room.key),
+        teacher=braitenberg.init(params.teacher),
+        frame=jnp.asarray(0, jnp.int32),
+        setbacks=jnp.asarray(0, jnp.int32),
+        fresh=jnp.asarray(True),
+        touched=jnp.asarray(False),
+        ok=jnp.asarray(True),
+    )
+
+
+def step(
+    params: Params, model: mjx.Model, room: Room, state: State, driver: Driver, draw: Bool[Array, ""] | bool = True
+) -> tuple[State, Record]:
+    """Run one frame: set back if it touched, sense, decide, move.
+
+    Without `draw` the eyes stay shut (u = 0.5): for drivers that do not look, in walks whose pictures nobody wants.
+    """
+    state = set_back(params, room, state, driver)
+    scene = arena.at(room.arena, state.frame / FRAME_RATE)
+    state, senses = sense(params, scene, state, draw)
+    state, label = decide(params, state, senses, driver)
+    moved, clearance = move(params, model, scene, state)
+    record = _record(state, senses, label, clearance)
+    return _keep_sound(state, moved), record
+
+
+def set_back(params: Params, room: Room, state: State, driver: Driver) -> State:
+    """Put a robot that touched something down at the room's next start, driver and rule as new, the rhythm going on."""
+    setbacks = state.setbacks + 1
+    start = jnp.take(room.starts, setbacks, axis=0, mode="wrap")
+    fresh_driver = driver.init(params.controller.driver, jax.random.fold_in(room.key, setbacks))
+    lifted = state.replace(
+        data=hexapod.put(state.data, start),
+        controller=state.controller.replace(driver=fresh_driver),
+        teacher=braitenberg.init(params.teacher),
+        setbacks=setbacks,
+        fresh=jnp.ones_like(state.fresh),
+    )
+    return _where(state.touched, lifted, state)
+
+
+def sense(
+    params: Params, scene: arena.Arena, state: State, draw: Bool[Array, ""] | bool = True
+) -> tuple[State, Senses]:
+    """Look and scan from where the robot stands; the LGMDs (eqs. 7-16) see the left and right hemifield."""
+    pose = hexapod.pose(state.data)
+    distances = laser.hemifields(laser.scan(params.laser, scene, *hexapod.laser_pose(pose)))
+    nerves = state.controller
+
+    def look(eyes: lgmd.State) -> tuple[lgmd.State, lgmd.Response]:
+        frames = camera.render(params.camera, scene, *hexapod.eye_poses(pose))
+        opened = _where(state.fresh, controller.open_eyes(params.controller, frames), eyes)
+        seeing, response = controller.see(params.controller, nerves.replace(lgmd=opened), frames)
+        return seeing.lgmd, response
+
+    def look_away(eyes: lgmd.State) -> tuple[lgmd.State, lgmd.Response]:
+        still = jnp.zeros_like(distances)
+        return eyes, lgmd.Response(u=still + lgmd.STILL, feed_forward=still, excitation=still)
+
+    # One program for both, which takes half a minute to compile; the choice is the same for a whole crowd.
+    eyes, response = jax.lax.cond(draw, look, look_away, nerves.lgmd)
+    senses = Senses(
+        u=response.u, feed_forward=response.feed_forward, excitation=response.excitation, distances=distances
+    )
+    return state.replace(controller=nerves.replace(lgmd=eyes)), senses
+
+
+def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tuple[State, Float[Array, "2"]]:
+    """Let the driver choose the velocity, and the rule (eq. 22, limited) label the frame."""
+    teacher, label = braitenberg.step(params.teacher, state.teacher, senses.distances)
+    nerves = controller.decide(params.controller, state.controller, senses, driver)
+    return state.replace(controller=nerves, teacher=teacher), label
+
+
+def move(
+    params: Params, model: mjx.Model, scene: arena.Arena, state: State
+) -> tuple[State, Float[Array, ""]]:
+    """Run rhythm, servos and body to the next frame; return the least clearance [m] on the way."""
+    model = hexapod.place_obstacles(model, scene, hexapod.pose(state.data))
+    interval = 1 / (FRAME_RATE * SUBSTEPS)
+
+    def substep(carry, _):
+        data, nerves = carry
+        nerves, targets = controller.move(params.controller, nerves, interval)
+        data = hexapod.substep(model, data, targets)
+        clearance = jnp.min(arena.clearance(scene, *hexapod.capsules(model, data)))
+        return (data, nerves), clearance
+
+    (data, nerves), clearances = jax.lax.scan(substep, (state.data, state.controller), length=SUBSTEPS)
+    clearance = jnp.min(clearances)
+    state = state.replace(
+        data=data,
+        controller=nerves,
+        frame=state.frame + 1,
+        fresh=jnp.zeros_like(state.fresh),
+        touched=clearance <= 0,
+    )
+    return state, clearance
+
+
+def _record(state: State, senses: Senses, label: Float[Array, "2"], clearance: Float[Array, ""]) -> Record:
+    pose = hexapod.pose(state.data)
+    return Record(
+        time=state.frame / FRAME_RATE,
+        position=pose.position,
+        quaternion=pose.quaternion,
+        joints=hexapod.joints(state.data),
+        u=senses.u,
+        feed_forward=senses.feed_forward,
+        excitation=senses.excitation,
+        distances=senses.distances,
+        label=label,
+        velocity=state.controller.velocity,
+        clearance=clearance,
+        contact=clearance <= 0,
+        fresh=state.fresh,
+        setbacks=state.setbacks,
+        ok=state.ok,
+    )
+
+
+def _keep_sound(before: State, after: State) -> State:
+    """Freeze a robot that fell or went non-finite at its last sound frame, for good; only the clock goes on."""
+    ok = before.ok & hexapod.is_sound(after.data)
+    return _where(ok, after, before).replace(ok=ok, frame=after.frame)
+
+
+def _where(condition: Bool[Array, ""], chosen: Any, otherwise: Any) -> Any:
+    """Choose between two pytrees of one structure."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), chosen, otherwise)

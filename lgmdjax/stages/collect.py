@@ -1,0 +1,74 @@
+"""Stage collect: choose the LGMD's thresholds on a first walk, then record the teacher's walks in many rooms.
+
+Writes calibration.json and episodes/*.parquet, one file an episode: each has new rooms, drawn from the seed and its
+number, so that an interrupted run carries on with the episode that it was at.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lgmdjax import calibration, drivers, episodes, hexapod, lgmd, rollout, scales
+from lgmdjax.runs import write_json
+from lgmdjax.stages import crew
+
+CALIBRATION = 2**20  # an episode number beyond any other: its rooms are met nowhere else
+
+
+def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Collect, seed: int) -> None:
+    """Calibrate, then record every episode that is not there yet."""
+    gait = inputs["fit-gait"]
+    if not (folder / "calibration.json").exists():
+        write_json(folder / "calibration.json", _calibrate(gait, settings, seed))
+    detector = load_detector(folder)
+    params = crew.seat(crew.robot(gait, settings.eyes, detector, crew.everyone()), drivers.TEACHER)
+    model = hexapod.build()
+    writer = episodes.Writer(folder / "episodes", _parameters(settings, detector))
+    for episode in range(writer.chunks, settings.episodes):
+        label = f"collect: episode {episode + 1} of {settings.episodes}"
+        rooms = rooms_of(seed, episode, settings.robots)
+        record = rollout.together(list(crew.walks(params, model, rooms, settings.seconds, label)))
+        numbers = episode * settings.robots + np.arange(settings.robots)
+        writer.write(record, episode=episode, rooms=numbers.tolist(), seed=seed)
+
+
+def rooms_of(seed: int, episode: int, robots: int):
+    """Draw the rooms of an episode, the same for the same seed and number."""
+    return rollout.random_rooms(jax.random.fold_in(jax.random.key(seed), episode), robots)
+
+
+def load_detector(folder: Path) -> lgmd.Params:
+    """Read the detector that `collect` calibrated."""
+    chosen = json.loads((folder / "calibration.json").read_text())
+    return lgmd.Params(threshold=chosen["threshold"], suppression=chosen["suppression"])
+
+
+def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any]:
+    """Walk the teacher with its eyes shut, draw what it would have seen, and choose the thresholds."""
+    shut = crew.robot(gait, settings.eyes, lgmd.Params(), crew.everyone())
+    rooms = rooms_of(seed, CALIBRATION, settings.robots)
+    walks = crew.walks(
+        crew.seat(shut, drivers.TEACHER), hexapod.build(), rooms, settings.calibration_seconds, "calibrate", draw=False
+    )
+    record = rollout.together(list(walks))
+    thresholds = jnp.asarray(calibration.THRESHOLDS)
+    print("calibrate: drawing the walks for all candidates of T_s", flush=True)
+    excitation, feed_forward = calibration.survey(
+        lgmd.Params(), crew.eyes(settings.eyes), rooms.arena, record.position, record.quaternion, thresholds
+    )
+    choice = calibration.choose(record, np.asarray(excitation), np.asarray(feed_forward), np.asarray(thresholds))
+    detector = {"inhibition": lgmd.Params().inhibition, "overlap": settings.eyes.overlap}
+    table = [row | detector | {"suppression": choice.suppression} for row in choice.table]
+    chosen = {"threshold": choice.threshold, "suppression": choice.suppression}
+    return {**chosen, **detector, "table": table}
+
+
+def _parameters(settings: scales.Collect, detector: lgmd.Params) -> dict[str, Any]:
+    thresholds = {"threshold": detector.threshold, "suppression": detector.suppression}
+    return {"eyes": dataclasses.asdict(settings.eyes), "seconds": settings.seconds, "lgmd": thresholds}

@@ -1,0 +1,106 @@
+"""What the stages share: one robot put together from the files of a run, and walks of a crowd with a progress bar."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from mujoco import mjx
+from tqdm import tqdm
+
+from lgmdjax import (
+    braitenberg,
+    camera,
+    controller,
+    cpg,
+    drivers,
+    laser,
+    lgmd,
+    navigator,
+    rollout,
+    scales,
+    shaping,
+    simulation,
+)
+
+
+def eyes(settings: scales.Eyes) -> camera.Params:
+    """Set up the stereo camera of a run."""
+    return camera.Params(width=settings.width, height=settings.height, overlap=settings.overlap)
+
+
+def robot(gait: Path, settings: scales.Eyes, detector: lgmd.Params, crew: drivers.Anyone) -> simulation.Params:
+    """Put a robot together: the gait that was fitted, the eyes of the run, and anyone at the wheel."""
+    teacher = crew.drivers[0]
+    nerves = controller.Params(
+        lgmd=_arrays(detector),
+        driver=crew,
+        cpg=_arrays(cpg.Params()),
+        shaping=shaping.load(gait / "shaping.safetensors"),
+    )
+    return simulation.Params(
+        controller=nerves, teacher=teacher, camera=eyes(settings), laser=_arrays(laser.Params())
+    )
+
+
+def everyone(
+    learned: navigator.Params | None = None, gain: float = 0.0, replayed: np.ndarray | None = None
+) -> drivers.Anyone:
+    """Seat all five drivers, the teacher at the wheel; those that nothing is known of yet are stand-ins.
+
+    Args:
+        learned: the trained navigator. gain: of the direct driver [1/m].
+        replayed: `REPLAY` commands of the teacher for the random driver.
+    """
+    teacher = _arrays(braitenberg.Params())
+    straight = jnp.stack([teacher.base, teacher.base])
+    commands = jnp.broadcast_to(straight, (REPLAY, 2)) if replayed is None else jnp.asarray(replayed, dtype=float)
+    return drivers.Anyone(
+        seat=jnp.asarray(0),
+        drivers=(
+            teacher,
+            navigator.create(jax.random.key(0)) if learned is None else learned,
+            drivers.Blind(velocity=straight),
+            drivers.Direct(rule=teacher, gain=jnp.asarray(gain, dtype=float)),
+            drivers.Replay(velocities=commands),
+        ),
+    )
+
+
+REPLAY = 4096  # commands of the random driver; a static number, so that one compiled program serves all stages
+
+
+def seat(params: simulation.Params, driver: drivers.Driver) -> simulation.Params:
+    """Put one of the drivers at the wheel."""
+    crew = params.controller.driver.replace(seat=jnp.asarray(drivers.ALL.index(driver)))
+    return params.replace(controller=params.controller.replace(driver=crew))
+
+
+def walks(
+    params: simulation.Params,
+    model: mjx.Model,
+    rooms: simulation.Room,
+    seconds: float,
+    label: str,
+    *,
+    draw: bool = True,
+    skip: int = 0,
+) -> Iterator[simulation.Record]:
+    """Walk a crowd and yield its chunks, with a bar of robot-seconds; the first chunk waits for the compiler."""
+    robots = rooms.starts.shape[0]
+    print(f"{label}: compiling the simulation, then {robots} robots for {seconds:g} s each", flush=True)
+    chunks = rollout.chunks(params, model, rooms, drivers.ANYONE, seconds, draw=draw, chunk_seconds=CHUNK)
+    with tqdm(total=robots * seconds, desc=label, unit="robot-s", bar_format=BAR) as bar:
+        for chunk in chunks:
+            bar.update(chunk.time.size / simulation.FRAME_RATE)
+            yield chunk
+
+
+CHUNK = 5.0  # s of robot time between two signs of life, and what an interruption loses
+BAR = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"
+
+
+def _arrays(params):
+    """Make arrays of a component's numbers, so that a program compiled for one value serves all."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), params)

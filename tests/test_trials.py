@@ -1,0 +1,97 @@
+"""Scores of walks whose answer is known by hand, and intervals against published tables and simulation."""
+
+import numpy as np
+import pytest
+
+from lgmdjax import trials
+from lgmdjax.errors import InputError
+from lgmdjax.simulation import Record
+
+CYCLE = 1.0
+SPEED = 0.05
+FRAMES = 1200
+
+
+def walk(robots: int = 2, **changes: np.ndarray) -> Record:
+    """Robots that walk straight at 0.05 m/s for 40 s, swaying 2 cm sideways once a gait cycle."""
+    time = np.arange(FRAMES) / 30.0
+    position = np.zeros((robots, FRAMES, 3))
+    position[..., 0] = SPEED * time
+    position[..., 1] = 0.02 * np.sin(2 * np.pi * time / CYCLE)
+    fields = {
+        "time": np.broadcast_to(time, (robots, FRAMES)),
+        "position": position,
+        "quaternion": np.broadcast_to([1.0, 0, 0, 0], (robots, FRAMES, 4)),
+        "joints": np.zeros((robots, FRAMES, 6, 3)),
+        **{name: np.zeros((robots, FRAMES, 2)) for name in ("u", "feed_forward", "excitation")},
+        **{name: np.zeros((robots, FRAMES, 2)) for name in ("distances", "label", "velocity")},
+        "clearance": np.full((robots, FRAMES), 0.3),
+        "contact": np.zeros((robots, FRAMES), bool),
+        "fresh": np.zeros((robots, FRAMES), bool),
+        "setbacks": np.zeros((robots, FRAMES), int),
+        "ok": np.ones((robots, FRAMES), bool),
+    }
+    return Record(**(fields | changes))
+
+
+def test_sway_does_not_count_as_distance():
+    result = trials.score(walk(), CYCLE)
+    assert result.distance == pytest.approx(2 * SPEED * FRAMES / 30, rel=0.02)
+    assert result.speed == pytest.approx(SPEED, rel=0.02)
+
+
+def test_setback_is_not_walked_and_a_touch_counts_once():
+    record = walk(1)
+    contact, setbacks, position = (np.array(x) for x in (record.contact, record.setbacks, record.position))
+    contact[0, 600] = True
+    setbacks[0, 601:] = 1
+    position[0, 601:, 0] += 3.0  # lifted 3 m ahead
+    result = trials.score(walk(1, contact=contact, setbacks=setbacks, position=position), CYCLE)
+    assert result.collisions == 1
+    assert result.distance == pytest.approx(SPEED * FRAMES / 30, rel=0.05)
+    assert result.first_collision.value == pytest.approx(SPEED * 20, rel=0.05)
+    assert result.per_100_m.value == pytest.approx(100 / result.distance)
+
+
+def test_lost_robot_counts_for_nothing_after_it_fell():
+    ok = np.ones((2, FRAMES), bool)
+    ok[1, 300:] = False
+    contact = np.zeros((2, FRAMES), bool)
+    contact[1, 900] = True
+    result = trials.score(walk(2, ok=ok, contact=contact), CYCLE)
+    assert (result.lost, result.collisions) == (1, 0)
+    assert result.distance == pytest.approx(SPEED * (40 + 10), rel=0.02)
+
+
+def test_walk_without_distance_is_an_input_error():
+    with pytest.raises(InputError, match="distance"):
+        trials.score(walk(1, ok=np.zeros((1, FRAMES), bool)), CYCLE)
+
+
+@pytest.mark.parametrize(("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.390)])
+def test_poisson_interval_matches_the_published_table(count, low, high):
+    """Garwood's limits as tabulated, for example, in Ulm (1990)."""
+    estimate = trials.poisson_rate(count, 1.0)
+    assert (estimate.low, estimate.high) == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=1e-3))
+
+
+def test_wilson_interval_matches_the_formula():
+    n, k, z = 240, 228, 1.959964
+    centre = (k + z**2 / 2) / (n + z**2)
+    half = z / (n + z**2) * np.sqrt(k * (n - k) / n + z**2 / 4)
+    estimate = trials.wilson(k, n)
+    assert (estimate.low, estimate.high) == (pytest.approx(centre - half, 1e-5), pytest.approx(centre + half, 1e-5))
+
+
+def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    intervals = [trials.bootstrap_mean(rng.exponential(1.0, 40)) for _ in range(100)]
+    covered = sum(interval.low <= 1.0 <= interval.high for interval in intervals)
+    assert 82 <= covered <= 100
+
+
+def test_yaw_rate_of_a_turning_robot():
+    yaw = np.broadcast_to(0.2 * np.arange(FRAMES) / 30.0, (1, FRAMES))
+    quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
+    rates = trials.yaw_rates(walk(1, quaternion=quaternion), CYCLE)
+    assert np.allclose(rates[0, 60:-60], 0.2, atol=1e-3)
