@@ -263,7 +263,7 @@ def _validate_texture(of: str, texture: Array) -> None:
 def _require(good: ArrayLike, expected: str, got: ArrayLike) -> None:
     """Raise for the first place where it is not `good`."""
     bad = np.argwhere(~np.asarray(good))
-    if bad.size:
+    if len(bad):
         place = tuple(int(i) for i in bad[0])
         where = f" at {place}" if place else ""
         raise InputError(f"expected {expected}, got {np.asarray(got)[place]}{where}; mend the room")
