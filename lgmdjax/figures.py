@@ -380,6 +380,7 @@ def trajectories(arena: Arena | None, walks: Mapping[str, Walks], first: str = "
         axes.grid(False)
         if name != first:
             axes.tick_params(labelleft=False, labelbottom=False, length=0)
+            axes.spines[:].set_visible(False)
     panels[first].set(xlabel="x [m]", ylabel="y [m]")
     panels[first].legend(loc="upper left", bbox_to_anchor=(0, -0.13), ncols=2, borderaxespad=0)
     return figure

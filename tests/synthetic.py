@@ -72,7 +72,7 @@ def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (24
         _json(folder / name / "done.json", {"seconds": 12.5, "device": "cpu, 2 cores"})
     versions = {"python": "3.11.9", "lgmdjax": "0.1.0", "jax": "0.9.2", "mujoco": "3.17.0"}
     settings = {
-        "collect": {"robots": 16, "seconds": 120, "width": 160, "height": 120},
+        "collect": {"robots": 16, "seconds": 120, "width": 80, "height": 60},
         "train": {"epochs": 40},
     }
     _json(
@@ -162,7 +162,7 @@ def _write_collect(folder: Path, generator: np.random.Generator) -> None:
 def _write_train(folder: Path, generator: np.random.Generator) -> None:
     epochs = np.arange(40)
     curves, table = {}, []
-    for name, floor in (("lstm", 0.20), ("lstm_command", 0.15), ("feed_forward", 0.42)):
+    for name, floor in (("lstm", 0.20), ("lstm-efference", 0.15), ("feed-forward", 0.42)):
         train = floor + np.exp(-epochs / 8) * np.exp(generator.normal(0, 0.03, 40))
         curves[name] = {"train": train.tolist(), "test": (train * 1.2 + 0.02).tolist()}
         table.append(

@@ -1,0 +1,253 @@
+"""The report: a run folder in, one self-contained page out that a stranger can read.
+
+Only files of the run folder are read; every number on the page comes from them. Pictures and the film are
+written into the page itself, so that it works offline. The page appears whole or not at all.
+
+| section       | made from                                                                   |
+| ------------- | --------------------------------------------------------------------------- |
+| result, film  | evaluate/evaluation.json, evaluate/walk.npz                                 |
+| legs          | gait/gait.json, gait/cpg.npz, gait/foot.npz                                 |
+| eyes          | evaluate/layers.npz, collect/calibration.json                               |
+| learning      | train/training.json, train/prediction.npz                                   |
+| walking       | evaluate/evaluation.json, evaluate/trajectories.npz                         |
+| how made      | run.json, the stages' done.json                                             |
+"""
+
+import base64
+import io
+import json
+import math
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+from matplotlib.figure import Figure
+
+from lgmdjax import arena, camera, figures, film, scenes
+from lgmdjax.errors import InputError
+
+MINUS = "\N{MINUS SIGN}"
+NOMINAL = 0.05  # m/s, the speed at v = 1
+STAGES = {"gait": "fit-gait", "collect": "collect", "train": "train", "evaluate": "evaluate"}
+"""Folder of a stage's files -> the command that makes them; a folder may also have the command's name."""
+PLACES = {"testing": "the testing room", "unseen": "random rooms never seen"}
+LOOKS_AT = {
+    "teacher": "laser scanner",
+    "learned": "both LGMDs",
+    "blind": "nothing",
+    "direct": "both LGMDs",
+    "random": "nothing",
+}
+LEARNERS = {
+    "lstm": "LSTM, the paper's",
+    "lstm-efference": "LSTM that also knows its last command",
+    "feed-forward": "feed-forward, no memory",
+    "mean": "the mean command, always",
+}
+Numbers = Mapping[str, np.ndarray]
+
+
+def render(
+    run: Path,
+    folder: Path | None = None,
+    *,
+    room: arena.Arena | None = None,
+    video_seconds: float = 10.0,
+) -> Path:
+    """Write the page of a run folder; give its path.
+
+    Args:
+        run: the run folder, with every stage before this one done.
+        folder: where index.html goes; report/ in the run folder if not given.
+        room: the room of the testing walks; the paper's testing room if not given.
+        video_seconds: length of the film.
+
+    Raises InputError when a file is missing or cannot be read, and names the stage that makes it.
+    """
+    room = scenes.testing_room() if room is None else room
+    page = _environment().get_template("report.html.j2")
+    try:
+        text = page.render(**_contents(run, room, video_seconds))
+    except (KeyError, jinja2.UndefinedError) as error:
+        raise InputError(
+            f"expected a run folder of this version of lgmdjax, {run} lacks {error}; delete it and run again"
+        ) from error
+    folder = run / "report" if folder is None else folder
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "index.html"
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+    return path
+
+
+def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, Any]:
+    """Gather everything that the template names."""
+    facts = read_json(run, "run.json")
+    gait, evaluation = read_json(run, "gait/gait.json"), read_json(run, "evaluate/evaluation.json")
+    training, calibration = read_json(run, "train/training.json"), read_json(run, "collect/calibration.json")
+    rhythm = read_arrays(run, "gait/cpg.npz")
+    drawn = {
+        **_gait_figures(run, gait, rhythm),
+        **_eye_figures(run, calibration),
+        **_learning_figures(run, training),
+        **_walking_figures(run, evaluation, room),
+    }
+    return {
+        "figures": {name: _inline_svg(figure) for name, figure in drawn.items()},
+        "film": _film(run, facts, calibration, room, video_seconds),
+        "facts": facts,
+        "gait": gait,
+        "rhythm": {name: float(rhythm[name]) for name in ("period", "transient_cycles")},
+        "calibration": calibration,
+        "training": training,
+        "evaluation": evaluation,
+        "verdicts": {place: verdict(scores) for place, scores in evaluation.items()},
+        "stages": _stages(run),
+        "places": PLACES,
+        "looks_at": LOOKS_AT,
+        "learners": LEARNERS,
+        "film_length": video_seconds,
+        "nominal": NOMINAL,
+    }
+
+
+def verdict(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare the learned controller with walking blindly: ratio of rates, and whether the intervals part."""
+    learned, blind = scores["learned"]["per_100_m"], scores["blind"]["per_100_m"]
+    return {
+        "ratio": learned["value"] / blind["value"] if blind["value"] else math.nan,
+        "half": learned["value"] < 0.5 * blind["value"],
+        "apart": learned["high"] < blind["low"],
+    }
+
+
+def read_json(run: Path, name: str) -> Any:
+    """Read a JSON file of the run folder."""
+    path = _find(run, name)
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, name, error) from error
+
+
+def read_arrays(run: Path, name: str) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz file of the run folder."""
+    path = _find(run, name)
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {key: arrays[key] for key in arrays.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise _unreadable(path, name, error) from error
+
+
+def _find(run: Path, name: str) -> Path:
+    """Find a file, in the folder named in the table above or in one named after the command that makes it."""
+    folder, _, rest = name.rpartition("/")
+    command = STAGES.get(folder, "reproduce")
+    for place in (run / name, run / command / rest):
+        if place.is_file():
+            return place
+    raise InputError(f"expected {name} in {run}, found none; run `lgmdjax {command}` first")
+
+
+def _unreadable(path: Path, name: str, error: Exception) -> InputError:
+    command = STAGES.get(name.rpartition("/")[0], "reproduce")
+    return InputError(
+        f"expected {path} as `lgmdjax {command}` writes it, got a file that cannot be read ({error}); "
+        f"delete its folder and run `lgmdjax {command}` again"
+    )
+
+
+def _gait_figures(run: Path, gait: Mapping[str, Any], rhythm: Numbers) -> dict[str, Figure]:
+    foot = read_arrays(run, "gait/foot.npz")
+    period, cycles = float(rhythm["period"]), float(rhythm["transient_cycles"])
+    return {
+        "rhythm": figures.rhythm(rhythm["time"], rhythm["rhythm"], period, cycles),
+        "foot": figures.foot_paths(foot["velocities"], foot["commanded"], foot["simulated"], foot["literal"]),
+        "sweep": figures.gait_sweep(gait["sweep"], gait["literal"], NOMINAL),
+    }
+
+
+def _eye_figures(run: Path, calibration: Mapping[str, Any]) -> dict[str, Figure]:
+    seen = read_arrays(run, "evaluate/layers.npz")
+    return {
+        "layers": figures.layers(seen["picture"], seen["E"], seen["I"], seen["S"]),
+        "calibration": figures.calibration(calibration["table"], calibration),
+    }
+
+
+def _learning_figures(run: Path, training: Mapping[str, Any]) -> dict[str, Figure]:
+    seen = read_arrays(run, "train/prediction.npz")
+    series = (seen[name] for name in ("time", "u", "distances", "label", "predicted"))
+    return {"losses": figures.losses(training["curves"], LEARNERS), "stretch": figures.stretch(*series)}
+
+
+def _walking_figures(run: Path, evaluation: Mapping[str, Any], room: arena.Arena) -> dict[str, Figure]:
+    paths = read_arrays(run, "evaluate/trajectories.npz")
+    walks = {
+        name: figures.Walks(*(paths[f"testing_{name}{part}"] for part in ("", "_setbacks", "_contact")))
+        for name in evaluation["testing"]
+    }
+    places = {PLACES[place]: scores for place, scores in evaluation.items()}
+    return {"trajectories": figures.trajectories(room, walks), "drivers": figures.drivers(places)}
+
+
+def _film(
+    run: Path, facts: Mapping[str, Any], calibration: Mapping[str, Any], room: arena.Arena, seconds: float
+) -> str:
+    """Draw the film of the learned controller's walk, its eyes as fine as they were; give a data address."""
+    recorded = read_arrays(run, "evaluate/walk.npz")
+    walk = film.Walk(*(recorded[name] for name in film.Walk._fields))
+    seen = facts.get("settings", {}).get("collect", {})
+    eyes = camera.Params(**{name: seen[name] for name in ("width", "height") if name in seen})
+    buffer = io.BytesIO()
+    film.write(buffer, walk, room, eyes, seconds, float(calibration.get("overlap", 1.0)))
+    return _inline("video/mp4", buffer.getvalue())
+
+
+def _stages(run: Path) -> list[dict[str, Any]]:
+    """Read how long each stage took and on what, where the stages left word of it."""
+    found = []
+    for folder, command in STAGES.items():
+        for path in (run / folder / "done.json", run / command / "done.json", run / f"{folder}.done.json"):
+            if path.is_file():
+                found.append({"name": command, **json.loads(path.read_text(encoding="utf-8"))})
+                break
+    return found
+
+
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("lgmdjax"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": _number, "fixed": _fixed}
+    return environment
+
+
+def _number(value: float, digits: int = 3) -> str:
+    """Write a number to so many significant digits, as short as it goes; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return np.format_float_positional(value, precision=digits, fractional=False, trim="-").replace("-", MINUS)
+
+
+def _fixed(value: float, decimals: int) -> str:
+    """Write a number to so many decimals; a dash where there is none."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", MINUS)
+
+
+def _inline_svg(figure: Figure) -> str:
+    return _inline("image/svg+xml", figures.to_svg(figure))
+
+
+def _inline(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
