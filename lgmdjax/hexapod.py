@@ -1,16 +1,15 @@
-"""The robot's body: a MuJoCo model of a PhantomX AX Mark II class hexapod, its readers, and obstacles to bump into.
+"""The robot's body: a MuJoCo model of a PhantomX AX Mark II class hexapod, and what reads and moves it.
 
-`mjcf/hexapod.xml` is the home of every mass, length, limit and gain; this module turns its names into static indices
-and reads poses out of `mjx.Data`. The `mjx.Model` is an argument everywhere, so that robots in rooms of their own are
-a `vmap`: the physics knows a few obstacle slots, which `place_obstacles` moves to the obstacles nearest to a robot.
+`mjcf/hexapod.xml` is the home of every mass, length, limit and gain; this module turns its names into static
+indices and reads poses out of `mjx.Data`. The `mjx.Model` is an argument everywhere, so that robots in rooms
+of their own are a `vmap`: the physics has a few obstacle slots, which `place_obstacles` moves to the nearest.
 
-    symbol      name                              unit
-    qpos        trunk position, quaternion        m, 1 (w x y z)
-                and 18 joint angles               rad
-    targets     servo set points (6, 3)           rad; legs left front ... right front, joints coxa, femur, tibia
+| symbol  | name                                              | unit               |
+| ------- | ------------------------------------------------- | ------------------ |
+| qpos    | trunk's position, its quaternion, 18 joint angles | m; 1 (w x y z); rad |
+| targets | servo set points (6, 3): a row a leg, as in LEGS  | rad                |
 
-World and body frames: x forward, y left, z up. Source of the numbers: the Mark II's firmware, the Mark IV's CAD masses,
-the AX-12A's manual and the paper (sec. 3.1), as noted in the XML.
+World and trunk frames: x forward, y left, z up. The sources of the numbers stand in the XML.
 """
 
 from functools import cache
@@ -32,8 +31,9 @@ from lgmdjax.errors import InputError
 LEGS = ("left_front", "left_middle", "left_rear", "right_rear", "right_middle", "right_front")
 JOINTS = ("coxa", "femur", "tibia")
 EYES = ("eye_left", "eye_right")
-LOWEST_TRUNK = 0.04  # m; below it the belly lies on the floor
+LOWEST, HIGHEST = 0.04, 0.30  # m; where the trunk of a robot on its feet can be
 LEAST_UPRIGHT = 0.7  # cosine of the trunk's tilt; below it (45 degrees) the robot has fallen
+ASIDE = 100.0  # m, the height at which a slot is out of the way
 
 
 @struct.dataclass(kw_only=True)
@@ -50,7 +50,7 @@ class _Anatomy(NamedTuple):
     stance: np.ndarray  # (25,) qpos of the default stance
     eyes: np.ndarray  # (2, 3) m, in the trunk's frame
     laser: np.ndarray  # (3,) m, in the trunk's frame
-    capsules: np.ndarray  # geoms that collide with obstacles
+    capsules: np.ndarray  # (13,) geoms that collide with obstacles
     feet: np.ndarray  # (6,) geoms that stand on the floor
     boxes: np.ndarray  # obstacle slots
     cylinders: np.ndarray
@@ -62,31 +62,46 @@ def xml_path() -> Path:
     for place in places:
         if (place / "hexapod.xml").is_file():
             return place / "hexapod.xml"
-    raise InputError(f"expected the robot's hexapod.xml in {' or '.join(map(str, places))}, found none: reinstall lgmdjax")
+    raise InputError(
+        f"expected hexapod.xml in {' or '.join(map(str, places))}, found none: reinstall lgmdjax"
+    )
 
 
 def load(path: Path | str | None = None) -> mujoco.MjModel:
-    """Load the robot, or a variant of it from a file of the same names, for C MuJoCo."""
-    path = Path(path) if path is not None else xml_path()
+    """Load the robot, or a variant of it with the same names from a file of the user's, for C MuJoCo."""
+    path = xml_path() if path is None else Path(path)
     if not path.is_file():
-        raise InputError(f"expected a robot XML file, {path} is none: give the path of a hexapod.xml")
+        raise InputError(f"expected a robot's XML file, {path} is none: give the path of a hexapod.xml")
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise InputError(f"expected a MuJoCo model in {path}, it does not compile: {error}") from None
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"expected a MuJoCo model in {path}, it does not compile ({reason}): mend it"
+        ) from None
+    servos = [model.actuator(i).name for i in range(model.nu)]
+    expected = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
+    if servos != expected:
+        raise InputError(
+            f"expected {len(expected)} servos {expected[0]} ... {expected[-1]} in {path}, got {len(servos)}"
+            f" ({', '.join(servos[:3])} ...): start from the hexapod.xml of this package"
+        )
+    return model
 
 
 def build(model: mujoco.MjModel | None = None) -> mjx.Model:
-    """Put the robot (default: `load()`) on the device for MJX."""
+    """Put the robot (default: `load()`) on the device for MJX, in the precision that JAX is set to."""
     with jax.numpy_dtype_promotion("standard"):
-        return mjx.put_model(model if model is not None else load(), impl="jax")
+        return mjx.put_model(load() if model is None else model, impl="jax")
 
 
 def differentiable(model: mjx.Model, *, soft: bool = False) -> mjx.Model:
     """Make the solver one that reverse mode passes through: one Newton iteration, four of line search.
 
-    `soft=True` also softens the contacts (solref 0.06, solimp 0.2 0.9 0.02), which smooths the landscape over larger
-    steps. Gradient: exact for the single iteration taken.
+    A walk is the same then; only kicks and blows need more iterations. `soft=True` also softens the contacts
+    (solref 0.06, solimp 0.2 0.9 0.02), so that the derivative says more about larger steps.
+
+    Gradient: exact for the one iteration.
     """
     model = model.replace(opt=model.opt.replace(iterations=1, ls_iterations=4))
     if not soft:
@@ -99,17 +114,17 @@ def differentiable(model: mjx.Model, *, soft: bool = False) -> mjx.Model:
 @cache
 def _anatomy() -> _Anatomy:
     model = load()
-    trunk_sites = {model.site(i).name: model.site(i).pos for i in range(model.nsite)}
     names = [model.geom(i).name for i in range(model.ngeom)]
 
     def geoms(prefix: str) -> np.ndarray:
         return np.array([i for i, name in enumerate(names) if name.startswith(prefix)])
 
+    limbs = [model.geom(f"{leg}_{part}").id for leg in LEGS for part in ("femur", "tibia")]
     return _Anatomy(
         stance=model.key("stance").qpos.copy(),
-        eyes=np.stack([trunk_sites[name] for name in EYES]),
-        laser=np.array(trunk_sites["laser"]),
-        capsules=geoms("hit_"),
+        eyes=np.stack([model.site(name).pos for name in EYES]),
+        laser=model.site("laser").pos.copy(),
+        capsules=np.array([model.geom("bumper").id, *limbs]),
         feet=np.array([model.geom(f"{leg}_foot").id for leg in LEGS]),
         boxes=geoms("slot_box_"),
         cylinders=geoms("slot_cylinder_"),
@@ -122,15 +137,15 @@ def stance() -> Float[np.ndarray, "6 3"]:
 
 
 def reset(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
-    """Stand a robot still on the floor at (x, y, yaw) [m, m, rad], in the default stance or with given joint angles."""
-    # Not put_data: its contact indices are narrower than those a step returns under x64, and a loop's carry keeps its types.
-    with jax.numpy_dtype_promotion("standard"):  # MJX itself multiplies truth values by floats
+    """Stand a robot still on the floor at (x, y, yaw) [m, m, rad], by default in the key frame's stance."""
+    # put_data's contact indices are narrower than a step's under x64, and a loop's carry must keep its types.
+    with jax.numpy_dtype_promotion("standard"):  # MJX multiplies truth values by floats
         data = mjx.make_data(model)
     return put(data, start, angles)
 
 
 def put(data: mjx.Data, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
-    """Lift a robot and put it down at (x, y, yaw), still, in the default stance or with given joint angles."""
+    """Lift a robot and put it down again, still, at (x, y, yaw) [m, m, rad]; angles as in `reset`."""
     stance = jnp.asarray(_anatomy().stance, data.qpos.dtype)
     joints = stance[7:] if angles is None else angles.reshape(18).astype(stance.dtype)
     x, y, yaw = start.astype(stance.dtype)
@@ -146,33 +161,42 @@ def put(data: mjx.Data, start: Float[Array, "3"], angles: Float[Array, "6 3"] | 
 
 
 def substep(model: mjx.Model, data: mjx.Data, targets: Float[Array, "6 3"]) -> mjx.Data:
-    """Advance the physics by one time step of the XML (1/180 s) with the servos set to the joint targets [rad].
+    """Advance the physics by the XML's time step (1/180 s) with the servos' set points at `targets` [rad].
 
-    Targets outside the joint limits are clipped by the servos. Gradient: through reverse mode only with
-    `differentiable(model)`; zero for clipped targets and for servos at their torque limit.
+    Set points beyond the joint limits are clipped.
+
+    Gradient: by reverse mode only with `differentiable(model)`; zero for a target that is clipped and for a
+    servo at its torque limit.
     """
-    with jax.numpy_dtype_promotion("standard"):  # MJX itself multiplies truth values by floats
+    with jax.numpy_dtype_promotion("standard"):  # MJX multiplies truth values by floats
         return mjx.step(model, data.replace(ctrl=targets.reshape(18).astype(data.ctrl.dtype)))
 
 
 def place_obstacles(model: mjx.Model, room: arena.Arena, pose: Pose) -> mjx.Model:
     """Move the obstacle slots of the physics to the walls, boxes and cylinders nearest to the robot.
 
-    A cylinder stands as a capsule whose caps reach beyond the cylinder's ends, into the floor and over the robot.
+    A cylinder is a capsule whose caps reach beyond its ends: into the floor, and above the robot. What hangs
+    overhead is put aside.
     """
     slots = _anatomy()
     boxes, cylinders = arena.nearest(room, pose.position[:2], len(slots.boxes), len(slots.cylinders))
-    position, size, quaternion = model.geom_pos, model.geom_size, model.geom_quat
-    for ids, prisms in ((slots.boxes, boxes), (slots.cylinders, cylinders)):
-        middle, half_height = (prisms.top + prisms.bottom) / 2, (prisms.top - prisms.bottom) / 2
-        turn = jnp.stack([jnp.cos(prisms.yaw / 2), 0 * prisms.yaw, 0 * prisms.yaw, jnp.sin(prisms.yaw / 2)], axis=-1)
-        position = position.at[ids].set(jnp.concatenate([prisms.centre, middle[:, None]], axis=-1))
-        quaternion = quaternion.at[ids].set(turn)
-        if ids is slots.boxes:
-            size = size.at[ids].set(jnp.concatenate([prisms.half_size, half_height[:, None]], axis=-1))
-        else:
-            size = size.at[ids, 0].set(prisms.half_size[:, 0]).at[ids, 1].set(half_height)
-    return model.replace(geom_pos=position, geom_size=size, geom_quat=quaternion)
+    ids = np.concatenate([slots.boxes, slots.cylinders])
+    kept = ("centre", "half_size", "yaw", "bottom", "top")
+    both = {name: jnp.concatenate([getattr(boxes, name), getattr(cylinders, name)]) for name in kept}
+    overhead = jnp.concatenate([arena.is_overhead(boxes), arena.is_overhead(cylinders)])
+    middle = jnp.where(overhead, ASIDE, (both["top"] + both["bottom"]) / 2)
+    half_height = (both["top"] - both["bottom"]) / 2
+    half_turn, zero = both["yaw"] / 2, jnp.zeros_like(both["yaw"])
+    # MuJoCo wants (x, y, z) half sizes of a box, (radius, half length) of a capsule.
+    length = jnp.where(np.isin(ids, slots.cylinders), half_height, both["half_size"][:, 1])
+    position = jnp.column_stack([both["centre"], middle])
+    size = jnp.column_stack([both["half_size"][:, 0], length, half_height])
+    quaternion = jnp.column_stack([jnp.cos(half_turn), zero, zero, jnp.sin(half_turn)])
+    return model.replace(
+        geom_pos=model.geom_pos.at[ids].set(position.astype(model.geom_pos.dtype)),
+        geom_size=model.geom_size.at[ids].set(size.astype(model.geom_size.dtype)),
+        geom_quat=model.geom_quat.at[ids].set(quaternion.astype(model.geom_quat.dtype)),
+    )
 
 
 def pose(data: mjx.Data) -> Pose:
@@ -193,7 +217,10 @@ def rotation(pose: Pose) -> Float[Array, "3 3"]:
 
 
 def yaw(pose: Pose) -> Float[Array, ""]:
-    """Return the heading [rad] in (-pi, pi]; positive is to the left. Gradient: undefined with the nose straight up."""
+    """Return the heading [rad] in (-pi, pi], positive to the left.
+
+    Gradient: undefined with the nose straight up.
+    """
     forward = rotation(pose)[:, 0]
     return jnp.arctan2(forward[1], forward[0])
 
@@ -224,14 +251,19 @@ def feet(data: mjx.Data) -> Float[Array, "6 3"]:
 def capsules(
     model: mjx.Model, data: mjx.Data
 ) -> tuple[Float[Array, "shapes 3"], Float[Array, "shapes 3"], Float[Array, " shapes"]]:
-    """Return ends [m] and radii [m] of the capsules with which trunk and legs collide, at the start of the last substep."""
+    """Read the capsules of trunk and legs that collide, as they were at the start of the last substep.
+
+    Returns:
+        Both ends (13, 3) [m, world] and radii (13,) [m]: the trunk's, then femur and tibia of each leg.
+    """
     ids = _anatomy().capsules
-    reach = data.geom_xmat[ids].reshape(-1, 3, 3)[..., 2] * model.geom_size[ids, 1, None]
-    return data.geom_xpos[ids] - reach, data.geom_xpos[ids] + reach, model.geom_size[ids, 0]
+    along = data.geom_xmat[ids].reshape(-1, 3, 3)[..., 2] * model.geom_size[ids, 1, None]
+    return data.geom_xpos[ids] - along, data.geom_xpos[ids] + along, model.geom_size[ids, 0]
 
 
 def is_sound(data: mjx.Data) -> Bool[Array, ""]:
-    """Tell whether the state is finite and the robot on its feet, neither fallen over nor lying on its belly."""
+    """Tell whether the state is finite and the robot on its feet: not fallen, on its belly or in the air."""
     finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
     upright = rotation(pose(data))[2, 2] > LEAST_UPRIGHT
-    return finite & upright & (data.qpos[2] > LOWEST_TRUNK)
+    height = data.qpos[2]
+    return finite & upright & (height > LOWEST) & (height < HIGHEST)
