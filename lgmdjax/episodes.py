@@ -241,9 +241,11 @@ def _table(record: Any, episode: int, rooms: Sequence[int], seed: int) -> pa.Tab
 
 
 def _walk(columns: Mapping[str, np.ndarray], frames: slice) -> Walk:
-    walk = {name: int(columns[name][frames][0]) for name in WALK}
+    walk: dict[str, Any] = {name: int(columns[name][frames][0]) for name in WALK}
     fields = {name: [columns[column][frames] for column in field.columns] for name, field in FIELDS.items()}
-    arrays = {name: np.stack(cols, axis=1) if len(cols) > 1 else cols[0] for name, cols in fields.items()}
+    arrays: dict[str, Any] = {
+        name: np.stack(cols, axis=1) if len(cols) > 1 else cols[0] for name, cols in fields.items()
+    }
     arrays["joints"] = arrays["joints"].reshape(-1, 6, 3)
     return Walk(**walk, **arrays)
 
