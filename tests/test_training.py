@@ -207,7 +207,7 @@ def test_a_place_that_is_no_folder_is_refused(data, tmp_path):
 
 
 def test_the_tape_holds_every_frame_once():
-    """In order along each stream; padding counts for nothing; mirrored streams have left and right exchanged."""
+    """In order along each stream; padding counts for nothing; mirrored streams are swapped."""
     walks = [walk(s, 50 + 7 * s) for s in range(5)]
     params = training.standardise(navigator.create(jax.random.key(0)), walks)
     tape = training._tape(params, walks, settings(streams=3, window=20, mirrored=True))
