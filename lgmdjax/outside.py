@@ -33,6 +33,7 @@ LIFT, LIFT_FLOOR = (
     0.45,
 )  # how much paler than to the robot's eyes the room is drawn, for it to stand out
 GLASS_FROM, GLASS_TO = 0.35, 0.10  # m from the line of sight, where it begins to and has become
+CLEAR = 0.55  # share of the line of sight that is kept clear
 SHADOW = 0.55  # of the light that a foot on the floor takes away
 TINTS = {
     "box": (0.80, 0.93, 1.0),
@@ -152,7 +153,8 @@ def _cast_room(
 
 def _opacity(arena: Arena, eye: Array, target: Array) -> Array:
     """How solid each prism is drawn: 1, but less near the line from the eye to the robot."""
-    line = eye[None, :2], target[None, :2]
+    # The line ends short of the robot: what stands beside or before it hides nothing.
+    line = eye[None, :2], (eye + CLEAR * (target - eye))[None, :2]
     near = jnp.concatenate(
         [distance_to_boxes(arena.boxes, *line)[0], distance_to_cylinders(arena.cylinders, *line)[0]]
     )
