@@ -33,19 +33,18 @@ def distance(
 
     Hard: no footprint, no blending. Gradient: that of the surface hit; zero where nothing is.
     """
-    hits = [
-        to_floor(origin, directions),
-        to_walls(arena, origin, directions),
-        jnp.min(to_boxes(arena.boxes, origin, directions), axis=-1),
-        jnp.min(to_cylinders(arena.cylinders, origin, directions), axis=-1),
-    ]
-    return jnp.min(jnp.stack(hits, axis=-1), axis=-1)
+    d = jnp.moveaxis(directions, -1, 0)
+    room = jnp.minimum(to_floor(origin, directions), to_walls(arena, origin, directions))
+    boxes = jnp.min(_to_boxes(arena.boxes, origin, d), axis=0)
+    cylinders = jnp.min(_to_cylinders(arena.cylinders, origin, d), axis=0)
+    return jnp.minimum(room, jnp.minimum(boxes, cylinders))
 
 
 def to_floor(origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays"]:
     """Measure t to the plane z = 0, from above only."""
-    falls = directions[..., 2] < -_TINY
-    t = -origin[2] / jnp.where(falls, directions[..., 2], -1.0)
+    d_z = directions[..., 2]
+    falls = d_z < -_TINY
+    t = -origin[2] / jnp.where(falls, d_z, -1.0)
     return jnp.where(falls & (t >= 0), t, jnp.inf)
 
 
@@ -53,9 +52,10 @@ def to_walls(
     arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]
 ) -> Float[Array, "*rays"]:
     """Measure t to the walls' inner faces: where the ray leaves the room, if below the walls' tops."""
-    low, high = arena.room[0::2], arena.room[1::2]
-    t_in, t_out = _slab(origin[:2], directions[..., :2], low, high)
-    t_in, t_out = jnp.max(t_in, axis=-1), jnp.min(t_out, axis=-1)
+    x_min, x_max, y_min, y_max = arena.room
+    x_in, x_out = _slab(origin[0], directions[..., 0], x_min, x_max)
+    y_in, y_out = _slab(origin[1], directions[..., 1], y_min, y_max)
+    t_in, t_out = jnp.maximum(x_in, y_in), jnp.minimum(x_out, y_out)
     z = origin[2] + t_out * directions[..., 2]
     hit = (t_out >= jnp.maximum(t_in, 0.0)) & (z >= 0) & (z <= arena.wall_height)
     return jnp.where(hit, t_out, jnp.inf)
@@ -65,36 +65,58 @@ def to_boxes(
     boxes: Prisms, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]
 ) -> Float[Array, "*rays n"]:
     """Measure t to every box, inf where it is missed."""
-    o = turned(origin[:2] - boxes.centre, -boxes.yaw)
-    d = turned(directions[..., None, :2], -boxes.yaw)
-    t_in, t_out = _slab(o, d, -boxes.half_size, boxes.half_size)
-    z_in, z_out = _slab(origin[2], directions[..., None, 2], boxes.bottom, boxes.top)
-    return _first(jnp.maximum(jnp.max(t_in, axis=-1), z_in), jnp.minimum(jnp.min(t_out, axis=-1), z_out))
+    return jnp.moveaxis(_to_boxes(boxes, origin, jnp.moveaxis(directions, -1, 0)), 0, -1)
 
 
 def to_cylinders(
     cylinders: Prisms, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]
 ) -> Float[Array, "*rays n"]:
-    """Measure t to every cylinder, inf where it is missed.
+    """Measure t to every cylinder, inf where it is missed."""
+    return jnp.moveaxis(_to_cylinders(cylinders, origin, jnp.moveaxis(directions, -1, 0)), 0, -1)
 
-    The footprint's interval is t_0 +- sqrt(r^2 - c^2/|d|^2)/|d| about the nearest approach t_0 = -o.d/|d|^2,
+
+# Here d is (3, *rays) and hits are (n, *rays): with the rays as the fastest axis a scan takes about half the
+# time that it takes with the prisms there.
+
+
+def _to_boxes(boxes: Prisms, o: Array, d: Array) -> Array:
+    """Distance to every box: the overlap of three slabs in its own frame."""
+    x, y = _leading(turned(o[:2] - boxes.centre, -boxes.yaw).T, d)
+    cosine, sine = _leading(jnp.stack([jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)]), d)
+    a, b = _leading(boxes.half_size.T, d)
+    low, high = _leading(jnp.stack([boxes.bottom, boxes.top]), d)
+    x_in, x_out = _slab(x, cosine * d[0] + sine * d[1], -a, a)
+    y_in, y_out = _slab(y, cosine * d[1] - sine * d[0], -b, b)
+    z_in, z_out = _slab(o[2], d[2], low, high)
+    return _first(jnp.maximum(jnp.maximum(x_in, y_in), z_in), jnp.minimum(jnp.minimum(x_out, y_out), z_out))
+
+
+def _to_cylinders(cylinders: Prisms, o: Array, d: Array) -> Array:
+    """Distance to every cylinder: the overlap of its disc's interval and its slab.
+
+    The disc's is t_0 +- sqrt(r^2 - c^2/|d|^2)/|d| about the nearest approach t_0 = -o.d/|d|^2, in the plane,
     with the moment c: the usual discriminant b^2 - a c cancels in float32.
     """
-    o = origin[:2] - cylinders.centre
-    d = directions[..., None, :2]
-    square = jnp.sum(d * d, axis=-1)
+    x, y = _leading((o[:2] - cylinders.centre).T, d)
+    radius, low, high = _leading(jnp.stack([cylinders.half_size[:, 0], cylinders.bottom, cylinders.top]), d)
+    square = jnp.sum(d[:2] * d[:2], axis=0)
     level = square > _TINY**2
-    square = jnp.where(level, square, _TINY**2)
-    c = o[..., 0] * d[..., 1] - o[..., 1] * d[..., 0]
-    # A vertical ray is inside the footprint for ever, or never.
-    radius = cylinders.half_size[..., 0]
-    margin = radius**2 - jnp.where(level, c * c / square, jnp.sum(o * o, axis=-1))
+    square = jnp.maximum(square, _TINY**2)
+    c = x * d[1] - y * d[0]
+    # A vertical ray is inside the disc for ever, or never.
+    margin: Array = radius**2 - jnp.where(level, c * c / square, x * x + y * y)
     meets = margin > 0
     half = jnp.sqrt(jnp.where(meets, margin, 1.0) / square)
-    middle = jnp.where(level, -jnp.sum(o * d, axis=-1) / square, 0.0)
-    z_in, z_out = _slab(origin[2], directions[..., None, 2], cylinders.bottom, cylinders.top)
+    along: Array = x * d[0] + y * d[1]
+    middle = jnp.where(level, -along / square, 0.0)
+    z_in, z_out = _slab(o[2], d[2], low, high)
     t = _first(jnp.maximum(middle - half, z_in), jnp.minimum(middle + half, z_out))
     return jnp.where(meets, t, jnp.inf)
+
+
+def _leading(rows: Array, d: Array) -> Array:
+    """Give columns (k, n) of prisms an axis of one for each axis of rays, to stand before them."""
+    return rows.reshape(*rows.shape, *(1 for _ in d.shape[1:]))
 
 
 def to_capsules(
