@@ -150,7 +150,7 @@ def _look(
 
 
 def _look_at_all(
-    frames: Iterable[video.Frame],
+    frames: tqdm,
     sheet: overlay.Sheet,
     target: Path,
     rate: Fraction,

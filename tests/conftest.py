@@ -13,10 +13,21 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls its own tuning f
 
 import jax
 import pytest
+from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--shapes", action="store_true", help="check every annotated shape while the tests run")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Put the check of shapes in place before any test imports the package."""
+    if config.getoption("--shapes"):
+        install_import_hook("lgmdjax", "shapecheck.check")
 
 
 @pytest.fixture
