@@ -166,7 +166,7 @@ def foot_paths(
         velocities: v of each path, in multiples of 0.05 m/s.
         commanded: where the joint targets put the foot [m].
         simulated: where it went in the simulated robot [m].
-        literal: where the targets put it without the adaptation input, v = 1 [m].
+        literal: where it went at v = 1 when the shaping had the paper's one input [m].
     """
     count = len(velocities)
     figure = Figure(figsize=(WIDTH, 2.5))
@@ -175,8 +175,8 @@ def foot_paths(
         _side_view(axes, walked, color=LEFT, label="simulated foot")
         _side_view(axes, asked, color=INK, linewidth=1.0, linestyle=(0, (3, 2)), label="commanded")
         axes.set_title(f"v = {v:g}")
-    _side_view(panels[-1], literal, color=RIGHT, label="commanded, CPG output alone")
-    panels[-1].set_title("v = 1, as printed")
+    _side_view(panels[-1], literal, color=RIGHT, label="simulated foot, with the paper's input")
+    panels[-1].set_title("v = 1, paper's input")
     for axes in panels:
         axes.set_xlabel("forward x [mm]")
     panels[0].set_ylabel("height z [mm]")
@@ -191,9 +191,7 @@ def _side_view(axes: Axes, path: Float[ndarray, "steps 3"], **style: Any) -> Non
 
 
 @styled
-def gait_sweep(
-    sweep: Sequence[Mapping[str, Any]], literal: Mapping[str, float], nominal: float = 0.05
-) -> Figure:
+def gait_sweep(sweep: Sequence[Mapping[str, Any]], literal: Mapping[str, float], nominal: float = 0.05) -> Figure:
     """Draw the speed asked for beside the speeds walked, and the turning rate over v_r - v_l.
 
     Args:
@@ -209,7 +207,7 @@ def gait_sweep(
     speed.plot(span, span * nominal, color=QUIET, linewidth=1, label="asked")
     speed.plot(v, [row["mjx"] for row in straight], "o", color=LEFT, markersize=6, label="walked, MJX")
     speed.plot(v, [row["c"] for row in straight], "x", color=INK, markersize=5, label="walked, C MuJoCo")
-    speed.plot([1], [literal["mjx"]], "D", color=RIGHT, markersize=5, label="walked, printed input")
+    speed.plot([1], [literal["mjx"]], "D", color=RIGHT, markersize=5, label="walked, paper's input")
     speed.set(xlabel="commanded v, both sides [0.05 m/s]", ylabel="forward speed [m/s]", title="straight on")
     speed.legend(loc="upper left")
     turns = [row for row in sweep if row["velocity"][0] != row["velocity"][1]] + straight
@@ -243,9 +241,7 @@ def layers(
     for axes, layer, title in zip(panels, shown, titles, strict=True):
         seen = layer is picture
         limits = {"vmin": 0, "vmax": 255} if seen else {"vmin": 0, "vmax": top}
-        images.append(
-            axes.imshow(layer, cmap="gray" if seen else "inferno", interpolation="nearest", **limits)
-        )
+        images.append(axes.imshow(layer, cmap="gray" if seen else "inferno", interpolation="nearest", **limits))
         axes.set_title(title)
         axes.set(xticks=[], yticks=[])
         axes.spines[:].set_visible(False)
@@ -261,31 +257,36 @@ def calibration(table: Sequence[Mapping[str, float]], chosen: Mapping[str, float
     """Draw the score of every candidate against its threshold T_s, a line for each of the other settings.
 
     Args:
-        table: rows with "threshold" [grey], "score", and whatever else was varied.
+        table: rows with "threshold" [grey], "score", whatever else was varied, and perhaps the "left" and "right"
+            correlations beside the score.
         chosen: the settings that were kept, "threshold" among them.
     """
     figure = Figure(figsize=(WIDTH, 2.7))
     axes = figure.subplots()
     varied = [name for name in ("overlap", "inhibition", "suppression") if _varies(table, name)]
     groups: dict[tuple, list[Mapping[str, float]]] = {}
-    for row in table:
+    for row in sorted(table, key=lambda row: row["threshold"]):
         groups.setdefault(tuple(row.get(name) for name in varied), []).append(row)
     shades = colormaps["viridis"](np.linspace(0, 0.9, len(groups)))
-    for shade, values in zip(shades, sorted(groups, key=str), strict=True):
-        rows = sorted(groups[values], key=lambda row: row["threshold"])
+    for shade, (values, rows) in zip(shades, groups.items(), strict=True):
         label = ", ".join(f"{name} {value:.3g}" for name, value in zip(varied, values, strict=True))
-        axes.plot(
-            [row["threshold"] for row in rows],
-            [row["score"] for row in rows],
-            "o-",
-            color=shade,
-            markersize=3,
-            label=label or None,
-        )
-    axes.axvline(chosen["threshold"], color=RIGHT, linewidth=1.2, linestyle="--", label="chosen T_s")
-    axes.set(xlabel="threshold T_s [grey levels]", ylabel="score [1]")
+        _candidates(axes, rows, "score", color=shade, marker="o", markersize=4, label=label or "left minus right")
+        for side, colour in (("left", LEFT), ("right", RIGHT)):
+            if side in rows[0] and not varied:
+                _candidates(axes, rows, side, color=colour, linewidth=1, label=f"{side} alone")
+    axes.axvline(chosen["threshold"], color=ALARM, linewidth=1.2, linestyle="--", label="chosen T_s")
+    axes.set(xlabel="threshold T_s [grey levels]", ylabel="correlation [1]")
+    if min(row["threshold"] for row in table) > 0:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
+
+
+def _candidates(axes: Axes, rows: Sequence[Mapping[str, float]], column: str, **style: Any) -> None:
+    axes.plot([row["threshold"] for row in rows], [row[column] for row in rows], **style)
 
 
 def _varies(table: Sequence[Mapping[str, float]], name: str) -> bool:
@@ -389,9 +390,7 @@ def trajectories(arena: Arena | None, walks: Mapping[str, Walks], first: str = "
 def draw_room(axes: Axes, arena: Arena) -> None:
     """Draw walls and obstacles from above: what hangs overhead in outline, ways of what moves dotted."""
     x_min, x_max, y_min, y_max = np.asarray(arena.room)
-    axes.add_patch(
-        Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=INK, linewidth=1.6)
-    )
+    axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=INK, linewidth=1.6))
     for prisms, outline in ((arena.boxes, _box), (arena.cylinders, _disc)):
         for index in np.flatnonzero(~np.asarray(is_parked(prisms))):
             overhead = bool(is_overhead(prisms)[index])

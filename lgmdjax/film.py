@@ -88,7 +88,7 @@ def write(
     _check(walk)
     chosen = choose(walk, round(seconds * RATE) * STRIDE)
     shots, body = _shots(walk, chosen[::STRIDE])
-    paper = _Paper(walk, chosen)
+    paper = _Paper(walk, chosen, (eyes.width, eyes.height))
     with video.writing(target, *SIZE, RATE) as show:
         for index, (stage, views) in enumerate(_draw(shots, body, room, eyes)):
             show(paper.picture(stage, views, chosen[index * STRIDE], overlap))
@@ -181,9 +181,7 @@ def bodies(walk: Walk, rows: ndarray) -> tuple[ndarray, ...]:
     data = mujoco.MjData(model)
     seen = np.flatnonzero(model.geom_group == 2)
     sites = [model.site(name).id for name in hexapod.EYES]
-    half_length = np.where(
-        model.geom_type[seen] == mujoco.mjtGeom.mjGEOM_CAPSULE, model.geom_size[seen, 1], 0.0
-    )
+    half_length = np.where(model.geom_type[seen] == mujoco.mjtGeom.mjGEOM_CAPSULE, model.geom_size[seen, 1], 0.0)
     found = []
     for row in rows:
         data.qpos[:] = np.concatenate([walk.position[row], walk.quaternion[row], walk.joints[row].ravel()])
@@ -229,11 +227,12 @@ def _drawer(view: outside.Params, eyes: camera.Params):
 class _Paper:
     """The film's page: drawn once by matplotlib, with and without its curves, then only cut and pasted."""
 
-    def __init__(self, walk: Walk, chosen: ndarray) -> None:
+    def __init__(self, walk: Walk, chosen: ndarray, pixels: tuple[int, int]) -> None:
         time = walk.time[chosen]
         self.contact = ndimage.maximum_filter1d(walk.contact.astype(float), 2 * STRIDE) > 0
-        self.blank, _ = _page(time, None)
-        self.full, columns = _page(time, (walk.u[chosen], walk.velocity[chosen]))
+        series = walk.u[chosen], walk.velocity[chosen]
+        self.blank, _ = _page(time, series, pixels, curves=False)
+        self.full, columns = _page(time, series, pixels, curves=True)
         self.column = dict(zip(chosen.tolist(), np.round(columns).astype(int).tolist(), strict=True))
 
     def picture(
@@ -257,31 +256,34 @@ class _Paper:
         return page
 
 
-def _page(time: ndarray, curves: tuple[ndarray, ndarray] | None) -> tuple[UInt8[ndarray, "h w 3"], ndarray]:
-    """Draw titles, axes and, if given, the curves; give the page and the column of each time."""
+def _page(
+    time: ndarray, series: tuple[ndarray, ndarray], pixels: tuple[int, int], *, curves: bool
+) -> tuple[UInt8[ndarray, "h w 3"], ndarray]:
+    """Draw titles, axes and, if wanted, the curves of u and v; give the page and the column of each time."""
     with matplotlib.rc_context({**STYLE, "figure.constrained_layout.use": False}):
         figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100)
-        titles = (
+        size = f"{pixels[0]} × {pixels[1]} pixels"
+        for place, title in (
             (STAGE, "the robot from outside, at twice its speed"),
-            (EYES[0], "left eye"),
-            (EYES[1], "right eye"),
-        )
-        for place, title in titles:
+            (EYES[0], f"left eye, {size}"),
+            (EYES[1], f"right eye, {size}"),
+        ):
             _write(figure, place[0], place[1] - 7, title)
         for index, line in enumerate(("Dimmed: not in the hemifield of this", "eye's collision detector.")):
             _write(figure, EYES[1][0], 552 + 18 * index, line, color="#555555")
         axes = [figure.add_axes(_fraction(place)) for place in CURVES]
-        axes[0].set(ylim=(0.48, 1.02), yticks=(0.5, 1.0), xticklabels=[])
+        # u seldom leaves the lower part of its range; the axis goes as far as it does.
+        top = max(0.6, 0.5 + 1.1 * (float(series[0].max()) - 0.5))
+        axes[0].set(ylim=(0.5 - 0.05 * (top - 0.5), top), title="LGMD outputs u", xticklabels=[])
         axes[1].set(ylim=(-1.15, 2.15), yticks=(-1, 0, 1, 2))
-        for panel, title in zip(
-            axes, ("LGMD outputs u", "commanded velocities v [0.05 m/s], over time [s]"), strict=True
-        ):
+        axes[1].set_title("commanded velocities v [0.05 m/s], over time [s]")
+        for panel, both in zip(axes, series, strict=True):
             panel.set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1)
             panel.spines[:].set_color(FAINT)
-            panel.set_title(title, fontsize=8.5, pad=4)
-        for panel, series in zip(axes, curves or (), strict=False):
-            for side, colour in enumerate((LEFT, RIGHT)):
-                panel.plot(time, series[:, side], color=colour, linewidth=1.3)
+            panel.title.set_fontsize(8.5)
+            for side, colour in enumerate((LEFT, RIGHT) if curves else ()):
+                panel.plot(time, both[:, side], color=colour, linewidth=1.3)
+        axes[0].locator_params(axis="y", nbins=3)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=100, facecolor="white")
         columns = axes[0].transData.transform(np.stack([time, 0 * time], axis=-1))[:, 0]

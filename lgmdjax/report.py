@@ -91,6 +91,7 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
     gait, evaluation = read_json(run, "gait/gait.json"), read_json(run, "evaluate/evaluation.json")
     training, calibration = read_json(run, "train/training.json"), read_json(run, "collect/calibration.json")
     rhythm = read_arrays(run, "gait/cpg.npz")
+    eyes = camera.Params(**{name: facts["settings"]["evaluate"]["eyes"][name] for name in ("width", "height")})
     drawn = {
         **_gait_figures(run, gait, rhythm),
         **_eye_figures(run, calibration),
@@ -99,7 +100,10 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
     }
     return {
         "figures": {name: _inline_svg(figure) for name, figure in drawn.items()},
-        "film": _film(run, facts, calibration, room, video_seconds),
+        "film": _film(run, eyes, calibration, room, video_seconds),
+        "eyes": eyes,
+        "layers_size": list(reversed(read_arrays(run, "evaluate/layers.npz")["picture"].shape)),
+        "rounds": facts["settings"]["train"].get("rounds", 0),
         "facts": facts,
         "gait": gait,
         "rhythm": {name: float(rhythm[name]) for name in ("period", "transient_cycles")},
@@ -197,16 +201,12 @@ def _walking_figures(run: Path, evaluation: Mapping[str, Any], room: arena.Arena
     return {"trajectories": figures.trajectories(room, walks), "drivers": figures.drivers(places)}
 
 
-def _film(
-    run: Path, facts: Mapping[str, Any], calibration: Mapping[str, Any], room: arena.Arena, seconds: float
-) -> str:
+def _film(run: Path, eyes: camera.Params, calibration: Mapping[str, Any], room: arena.Arena, seconds: float) -> str:
     """Draw the film of the learned controller's walk, its eyes as fine as they were; give a data address."""
     recorded = read_arrays(run, "evaluate/walk.npz")
     walk = film.Walk(*(recorded[name] for name in film.Walk._fields))
-    seen = facts.get("settings", {}).get("collect", {})
-    eyes = camera.Params(**{name: seen[name] for name in ("width", "height") if name in seen})
     buffer = io.BytesIO()
-    film.write(buffer, walk, room, eyes, seconds, float(calibration.get("overlap", 1.0)))
+    film.write(buffer, walk, room, eyes, seconds, float(calibration["overlap"]))
     return _inline("video/mp4", buffer.getvalue())
 
 

@@ -97,9 +97,7 @@ def test_text_is_outlines_so_that_no_font_is_needed(drawn: dict[str, Figure], na
 
 
 def test_same_numbers_same_bytes(run: Path):
-    first, second = (
-        figures.to_svg(figures.stretch(**dict(np.load(run / "train/prediction.npz")))) for _ in "12"
-    )
+    first, second = (figures.to_svg(figures.stretch(**dict(np.load(run / "train/prediction.npz")))) for _ in "12")
     assert first == second
 
 
@@ -134,11 +132,7 @@ def test_turning_left_is_up_where_the_right_side_is_faster(drawn: dict[str, Figu
 
 
 def test_layers_share_one_scale(drawn: dict[str, Figure]):
-    limits = {
-        axes.get_title(loc="left")[0]: axes.images[0].get_clim()
-        for axes in drawn["layers"].axes
-        if axes.images
-    }
+    limits = {axes.get_title(loc="left")[0]: axes.images[0].get_clim() for axes in drawn["layers"].axes if axes.images}
     assert limits["1"] == (0, 255)
     assert limits["2"] == limits["3"] == limits["4"]
 
@@ -159,14 +153,8 @@ def test_losses_are_on_one_log_axis_with_the_constant_as_a_level(drawn: dict[str
 
 def test_a_set_back_breaks_the_path_and_a_touch_is_marked(run: Path, drawn: dict[str, Figure]):
     paths = walks(dict(np.load(run / "evaluate/trajectories.npz")), "learned")
-    assert np.linalg.norm(np.diff(paths.positions[0], axis=0), axis=-1).max() > 1.0, (
-        "the walk must have a set-back"
-    )
-    lines = [
-        line
-        for line in panel(drawn["trajectories"], "learned").lines
-        if len(np.asarray(line.get_xdata())) > 2
-    ]
+    assert np.linalg.norm(np.diff(paths.positions[0], axis=0), axis=-1).max() > 1.0, "the walk must have a set-back"
+    lines = [line for line in panel(drawn["trajectories"], "learned").lines if len(np.asarray(line.get_xdata())) > 2]
     longest = max(np.linalg.norm(np.diff(line.get_xydata(), axis=0), axis=-1).max() for line in lines)
     assert longest < 0.06
     crosses = [line for line in panel(drawn["trajectories"], "learned").lines if line.get_marker() == "X"]
@@ -185,9 +173,7 @@ def test_the_room_is_drawn_where_it_is(drawn: dict[str, Figure]):
     # A box 0.6 x 1.0 m about (2, 1), turned by 0.4 rad: its corner at (+a, +b).
     corner = 2.0 + 0.3 * np.cos(0.4) - 0.5 * np.sin(0.4), 1.0 + 0.3 * np.sin(0.4) + 0.5 * np.cos(0.4)
     assert np.min(np.linalg.norm(boxes[0].get_xy() - corner, axis=-1)) < 1e-6
-    assert [box.get_linestyle() for box in boxes] == ["-", "-", "--"], (
-        "the one that hangs overhead is an outline"
-    )
+    assert [box.get_linestyle() for box in boxes] == ["-", "-", "--"], "the one that hangs overhead is an outline"
 
 
 def test_trajectories_without_a_room_or_other_drivers(run: Path):

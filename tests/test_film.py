@@ -35,9 +35,7 @@ def decoded(walk: film.Walk) -> tuple[list[np.ndarray], float]:
     buffer.seek(0)
     with av.open(buffer, "r") as container:
         stream = container.streams.video[0]
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)], float(
-            stream.average_rate or 0
-        )
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)], float(stream.average_rate or 0)
 
 
 def test_film_has_its_pictures_size_and_rate(decoded: tuple[list[np.ndarray], float]):
@@ -67,13 +65,11 @@ def test_the_robot_moves_in_the_film(decoded: tuple[list[np.ndarray], float]):
 
 def test_what_the_detector_does_not_see_is_dimmed(walk: film.Walk):
     white = np.full((2, 60, 80), 250, np.uint8)
-    page = film._Paper(walk, np.arange(60)).picture(np.zeros((100, 160, 3), np.uint8), white, 0, overlap=0.6)
+    page = film._Paper(walk, np.arange(60), (80, 60)).picture(np.zeros((100, 160, 3), np.uint8), white, 0, overlap=0.6)
     for (x, y, width, _), first, last in zip(film.EYES, (0.0, 0.4), (0.6, 1.0), strict=True):
         row, across = page[y + 50, x : x + width, 0], np.arange(width) / width
         assert np.all(row[(across > first + 0.03) & (across < last - 0.03)] == 250)
-        np.testing.assert_allclose(
-            row[(across < first - 0.03) | (across > last + 0.03)], 250 * film.DIMMED, atol=1
-        )
+        np.testing.assert_allclose(row[(across < first - 0.03) | (across > last + 0.03)], 250 * film.DIMMED, atol=1)
 
 
 def test_eyes_are_where_the_trunk_carries_them(walk: film.Walk):
@@ -96,9 +92,7 @@ def test_the_robot_is_always_in_the_window_that_is_cast_for_it(walk: film.Walk):
         column = view.width / 2 - view.focal * seen[:, 1] / seen[:, 0]
         row = view.height / 2 - view.focal * seen[:, 2] / seen[:, 0]
         reach = view.focal * float(body.radii.max()) / float(seen[:, 0].min())
-        assert (
-            view.columns[0] <= float(column.min()) - reach and float(column.max()) + reach <= view.columns[1]
-        )
+        assert view.columns[0] <= float(column.min()) - reach and float(column.max()) + reach <= view.columns[1]
         assert view.rows[0] <= float(row.min()) - reach and float(row.max()) + reach <= view.rows[1]
 
 
@@ -116,9 +110,7 @@ def look() -> Callable[..., np.ndarray]:
     draw = jax.jit(partial(outside.picture, SMALL))
 
     def at(room: arena.Arena, shift: float = 0.0) -> np.ndarray:
-        body = ball._replace(
-            starts=ball.starts + jnp.array([shift, 0, 0]), ends=ball.ends + jnp.array([shift, 0, 0])
-        )
+        body = ball._replace(starts=ball.starts + jnp.array([shift, 0, 0]), ends=ball.ends + jnp.array([shift, 0, 0]))
         return np.asarray(draw(room, jnp.asarray(eye[0]), rotation, body, jnp.asarray(target[0])))
 
     return at
@@ -160,9 +152,7 @@ def test_what_stands_in_front_turns_to_glass_and_what_stands_behind_does_not(loo
 def test_surfaces_are_shaded_by_where_they_face(look: Callable[..., np.ndarray]):
     """A plain grey box: its top, which faces the light, is brighter than the face towards the camera."""
     plain = (128.0, 0.0, 0.0, 0.5)
-    picture = look(
-        arena.empty_room(boxes=arena.place([[0.9, 0.0]], [[0.2, 0.4]], 0.4, texture=plain)), shift=5.0
-    )
+    picture = look(arena.empty_room(boxes=arena.place([[0.9, 0.0]], [[0.2, 0.4]], 0.4, texture=plain)), shift=5.0)
     box = (picture[..., 2] > 1.1 * picture[..., 0])[:, 80]  # boxes are tinted blue
     rows = np.flatnonzero(box)
     assert picture[rows[1], 80].mean() > 1.2 * picture[rows[-3], 80].mean()

@@ -81,9 +81,7 @@ def text_of(run: Path) -> str:
 
 
 def inlined(source: str, kind: str) -> list[bytes]:
-    return [
-        base64.b64decode(code) for code in re.findall(rf'"data:{re.escape(kind)};base64,([^"]+)"', source)
-    ]
+    return [base64.b64decode(code) for code in re.findall(rf'"data:{re.escape(kind)};base64,([^"]+)"', source)]
 
 
 def test_the_page_needs_nothing_but_itself(source: str):
@@ -91,9 +89,7 @@ def test_the_page_needs_nothing_but_itself(source: str):
     assert not page.open, "every tag is closed"
     assert "http://" not in source and "https://" not in source
     assert "<script" not in source and "@import" not in source
-    addresses = [
-        value for _, name, value in page.attributes if name in ("src", "href", "poster", "srcset", "data")
-    ]
+    addresses = [value for _, name, value in page.attributes if name in ("src", "href", "poster", "srcset", "data")]
     anchors = {value for _, name, value in page.attributes if name == "id"}
     assert len(addresses) > 10
     assert all(value.startswith("data:") or value.removeprefix("#") in anchors for value in addresses)
@@ -105,9 +101,7 @@ def test_all_figures_are_there_and_are_pictures_that_need_nothing(source: str):
     assert len(pictures) == 9
     for picture in pictures:
         root = ElementTree.fromstring(picture)
-        links = [
-            value for node in root.iter() for name, value in node.attrib.items() if name.endswith("href")
-        ]
+        links = [value for node in root.iter() for name, value in node.attrib.items() if name.endswith("href")]
         assert all(link.startswith(("#", "data:")) for link in links)
     described = [value for tag, name, value in Page(source).attributes if tag == "img" and name == "alt"]
     assert len(described) == 9 and all(described)
@@ -142,9 +136,7 @@ def test_numbers_come_from_the_files(source: str):
 
 
 def test_other_numbers_make_another_page(copy: Path):
-    places = {
-        "unseen": {name: synthetic.score(rate) for name, rate in {"learned": 1.234, "blind": 43.21}.items()}
-    }
+    places = {"unseen": {name: synthetic.score(rate) for name, rate in {"learned": 1.234, "blind": 43.21}.items()}}
     testing = json.loads((copy / "evaluate/evaluation.json").read_text())["testing"]
     (copy / "evaluate/evaluation.json").write_text(json.dumps({"testing": testing, **places}))
     rewrite(copy, "run.json", seed=8)
