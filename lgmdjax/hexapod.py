@@ -15,7 +15,7 @@ World and trunk frames: x forward, y left, z up. The sources of the numbers stan
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,7 @@ def load(path: Path | str | None = None) -> mujoco.MjModel:
 def build(model: mujoco.MjModel | None = None) -> mjx.Model:
     """Put the robot (default: `load()`) on the device for MJX, in the precision that JAX is set to."""
     with jax.numpy_dtype_promotion("standard"):
-        return mjx.put_model(load() if model is None else model, impl="jax")
+        return _free(mjx.put_model(load() if model is None else model, impl="jax"))
 
 
 def differentiable(model: mjx.Model, *, soft: bool = False) -> mjx.Model:
@@ -131,6 +131,16 @@ def _anatomy() -> _Anatomy:
     )
 
 
+def _free(tree: Any) -> Any:
+    """Untie arrays from the device that MJX put them on.
+
+    Tied ones would not be sharded with others, and `jit` compiles anew for each mixture of tied and free arguments.
+    """
+    return jax.tree.map(
+        lambda leaf: leaf if isinstance(leaf, jax.core.Tracer) else jnp.array(np.asarray(leaf)), tree
+    )
+
+
 def stance() -> Float[np.ndarray, "6 3"]:
     """Return the joint angles [rad] of the default stance (the XML's key frame)."""
     return _anatomy().stance[7:].reshape(6, 3)
@@ -140,7 +150,7 @@ def reset(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"
     """Stand a robot still on the floor at (x, y, yaw) [m, m, rad], by default in the key frame's stance."""
     # put_data's contact indices are narrower than a step's under x64, and a loop's carry must keep its types.
     with jax.numpy_dtype_promotion("standard"):  # MJX multiplies truth values by floats
-        data = mjx.make_data(model)
+        data = _free(mjx.make_data(model))
     return put(data, start, angles)
 
 
