@@ -138,17 +138,8 @@ def rhythm(
             axes.plot(time, outputs[:, leg], color=PALETTE[tripod], linestyle=style, label=LEGS[leg])
         axes.set_ylabel("CPG output [1]")
         axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0)
-        axes.set_title(f"tripod {tripod + 1}")
+        axes.set_title(f"tripod {tripod + 1}" + ("" if tripod else ", transient shaded"))
         axes.margins(x=0)
-    rows[0].annotate(
-        "transient",
-        (time[0], 1),
-        xycoords=("data", "axes fraction"),
-        xytext=(3, -10),
-        textcoords="offset points",
-        color=QUIET,
-        fontsize=8,
-    )
     rows[1].set_xlabel("time [s]")
     return figure
 

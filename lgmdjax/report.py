@@ -242,7 +242,9 @@ def _number(value: float, digits: int = 3) -> str:
 
 def _fixed(value: float, decimals: int) -> str:
     """Write a number to so many decimals; a dash where there is none."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}".replace("-", MINUS)
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", MINUS)  # + 0.0 makes -0 plain 0
 
 
 def _inline_svg(figure: Figure) -> str:

@@ -110,7 +110,7 @@ def test_matplotlib_is_left_as_it_was(run: Path):
 
 def test_each_tripod_has_a_panel_of_its_own(run: Path, drawn: dict[str, Figure]):
     outputs = np.load(run / "gait/cpg.npz")["rhythm"]
-    for tripod, legs in (("tripod 1", (0, 2, 4)), ("tripod 2", (1, 3, 5))):
+    for tripod, legs in (("tripod 1, transient shaded", (0, 2, 4)), ("tripod 2", (1, 3, 5))):
         lines = panel(drawn["rhythm"], tripod).lines
         assert [line.get_label() for line in lines] == [figures.LEGS[leg] for leg in legs]
         for line, leg in zip(lines, legs, strict=True):
