@@ -20,7 +20,6 @@ Source: Cizek & Faigl, eqs. 12-16 and sec. 3.3; the statistic is our own.
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float

@@ -18,6 +18,7 @@ Source: Cizek & Faigl, "Self-supervised learning of the biologically-inspired ob
 walking robot", fig. 2 and sec. 3.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -67,20 +68,20 @@ def open_eyes(params: Params, frames: Float[Array, "2 height width"]) -> lgmd.St
 def see(params: Params, state: State, frames: Float[Array, "2 height width"]) -> tuple[State, lgmd.Response]:
     """Show one stereo frame to the two LGMDs (eqs. 7-16); the response has one entry an eye, left first."""
     eyes, response = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(params.lgmd, state.lgmd, frames)
-    return state.replace(lgmd=eyes), response
+    return replace(state, lgmd=eyes), response
 
 
 def decide(params: Params, state: State, senses: Senses, driver: Driver) -> State:
     """Let the driver turn the senses into the standing command (eq. 17)."""
     driven, velocity = driver.step(params.driver, state.driver, senses)
-    return state.replace(driver=driven, velocity=velocity)
+    return replace(state, driver=driven, velocity=velocity)
 
 
 def move(params: Params, state: State, interval: float) -> tuple[State, Float[Array, "6 3"]]:
     """Advance the rhythm by `interval` seconds and shape it into joint targets [rad] for the standing command."""
     rhythm_state, rhythm = cpg.step(params.cpg, state.cpg, interval)
     targets = shaping.shape(params.shaping, rhythm, state.velocity)
-    return state.replace(cpg=rhythm_state), targets
+    return replace(state, cpg=rhythm_state), targets
 
 
 def step(

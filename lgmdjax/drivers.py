@@ -13,6 +13,7 @@ velocity)`, with the velocity in multiples of the nominal 0.05 m/s, left first.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -70,7 +71,7 @@ def _step_teacher(params: braitenberg.Params, state: braitenberg.State, senses: 
 def _step_learned(params: navigator.Params, state: navigator.State, senses: Senses):
     state, asked = navigator.step(params, state, senses.u)
     velocity = braitenberg.limit(braitenberg.Params(), asked)
-    return state.replace(velocity=velocity), velocity  # what was done, not what was asked, is its next input
+    return replace(state, velocity=velocity), velocity  # what was done, not what was asked, is its next input
 
 
 def _step_blind(params: Blind, state: None, senses: Senses):

@@ -44,7 +44,14 @@ def start(params: Params, model: mjx.Model, rooms: Room, *, driver: Driver) -> S
 
 @partial(jax.jit, static_argnames=("driver", "frames"), donate_argnames="states")
 def advance(
-    params: Params, model: mjx.Model, rooms: Room, states: State, *, driver: Driver, frames: int, draw: Bool[Array, ""] | bool
+    params: Params,
+    model: mjx.Model,
+    rooms: Room,
+    states: State,
+    *,
+    driver: Driver,
+    frames: int,
+    draw: Bool[Array, ""] | bool,
 ) -> tuple[State, Record]:
     """Walk a batch of robots, each in its own room; the record's axes are (robot, frame)."""
     one = lambda room, state: walk(params, model, room, state, driver, frames, draw)  # noqa: E731
@@ -70,7 +77,7 @@ def chunks(
     states = start(params, model, rooms, driver=driver)
     for done in range(0, total, frames):
         states, record = advance(params, model, rooms, states, driver=driver, frames=frames, draw=draw)
-        yield jax.tree.map(lambda leaf: np.asarray(leaf)[:, : total - done], record)
+        yield jax.tree.map(lambda leaf, left=total - done: np.asarray(leaf)[:, :left], record)
 
 
 def together(records: list[Record]) -> Record:

@@ -42,18 +42,23 @@ class Collect:
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """The navigator and those it is compared with."""
+    """The navigator and those it is compared with, after some rounds of walking itself and being corrected."""
 
+    eyes: Eyes
     epochs: int
+    rounds: int
+    round_epochs: int
+    robots: int
+    round_seconds: float  # of each robot
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Every driver on the same seeds: in the testing room, and in as many unseen rooms."""
+    """Every driver on the same seeds: as many robots in the testing room, and in unseen rooms of their own."""
 
-    rooms: int
+    eyes: Eyes
+    robots: int
     seconds: float
-    metres: float  # walked in the testing room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,26 +68,28 @@ class Report:
     video_seconds: float
 
 
+_SMALL, _QUICK, _PAPER = Eyes(width=64, height=48), Eyes(width=80, height=60), Eyes(width=320, height=240)
+
 SCALES: Mapping[Scale, Mapping[str, Any]] = {
     "smoke": {
-        "fit-gait": FitGait(steps=200, seconds=6),
-        "collect": Collect(robots=2, seconds=10, width=80, height=60),
-        "train": Train(epochs=5),
-        "evaluate": Evaluate(rooms=2, seconds=5, metres=0.5),
+        "fit-gait": FitGait(steps=300, seconds=6),
+        "collect": Collect(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=10),
+        "train": Train(eyes=_SMALL, epochs=5, rounds=1, round_epochs=5, robots=4, round_seconds=10),
+        "evaluate": Evaluate(eyes=_SMALL, robots=4, seconds=10),
         "report": Report(video_seconds=2),
     },
     "quick": {
         "fit-gait": FitGait(steps=3000, seconds=20),
-        "collect": Collect(robots=16, seconds=120, width=160, height=120),
-        "train": Train(epochs=200),
-        "evaluate": Evaluate(rooms=16, seconds=60, metres=20),
-        "report": Report(video_seconds=15),
+        "collect": Collect(eyes=_QUICK, robots=16, episodes=4, seconds=60, calibration_seconds=20),
+        "train": Train(eyes=_QUICK, epochs=60, rounds=2, round_epochs=40, robots=16, round_seconds=60),
+        "evaluate": Evaluate(eyes=_QUICK, robots=16, seconds=60),
+        "report": Report(video_seconds=10),
     },
     "paper": {
-        "fit-gait": FitGait(steps=4500, seconds=20),
-        "collect": Collect(robots=16, seconds=900, width=320, height=240),
-        "train": Train(epochs=1000),
-        "evaluate": Evaluate(rooms=64, seconds=180, metres=235.3),
-        "report": Report(video_seconds=60),
+        "fit-gait": FitGait(steps=6000, seconds=20),
+        "collect": Collect(eyes=_PAPER, robots=16, episodes=1, seconds=56.25, calibration_seconds=30),
+        "train": Train(eyes=_PAPER, epochs=1000, rounds=2, round_epochs=200, robots=16, round_seconds=60),
+        "evaluate": Evaluate(eyes=_PAPER, robots=16, seconds=270),
+        "report": Report(video_seconds=30),
     },
 }

@@ -10,10 +10,12 @@ start, as an experimenter would lift it, so that one walk can count several coll
 not finite, or that fell over, is frozen where it was and flagged by `ok`; nothing here raises.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
@@ -21,6 +23,7 @@ from mujoco import mjx
 from lgmdjax import arena, braitenberg, camera, controller, hexapod, laser, lgmd
 from lgmdjax.drivers import Driver, Senses
 
+Leaf = Array | np.ndarray
 FRAME_RATE = 30.0  # Hz, the camera's (paper sec. 3.1)
 SUBSTEPS = 6  # physics steps a frame; the robot's XML has the time step that makes them fill it
 
@@ -60,23 +63,23 @@ class State:
 
 @struct.dataclass(kw_only=True)
 class Record:
-    """What one frame leaves behind; the pose is the one from which the pictures were drawn."""
+    """What one frame leaves behind; the pose is the one from which the pictures were drawn. NumPy's on the host."""
 
-    time: Float[Array, ""]  # s
-    position: Float[Array, "3"]  # m
-    quaternion: Float[Array, "4"]  # w x y z
-    joints: Float[Array, "6 3"]  # rad
-    u: Float[Array, "2"]
-    feed_forward: Float[Array, "2"]  # grey
-    excitation: Float[Array, "2"]  # grey, U / n_cell
-    distances: Float[Array, "2"]  # m
-    label: Float[Array, "2"]  # the teacher's velocity
-    velocity: Float[Array, "2"]  # the driver's velocity
-    clearance: Float[Array, ""]  # m, the least within the frame
-    contact: Bool[Array, ""]  # clearance <= 0 in some substep
-    fresh: Bool[Array, ""]
-    setbacks: Int[Array, ""]
-    ok: Bool[Array, ""]
+    time: Float[Leaf, ""]  # s
+    position: Float[Leaf, "3"]  # m
+    quaternion: Float[Leaf, "4"]  # w x y z
+    joints: Float[Leaf, "6 3"]  # rad
+    u: Float[Leaf, "2"]
+    feed_forward: Float[Leaf, "2"]  # grey
+    excitation: Float[Leaf, "2"]  # grey, U / n_cell
+    distances: Float[Leaf, "2"]  # m
+    label: Float[Leaf, "2"]  # the teacher's velocity
+    velocity: Float[Leaf, "2"]  # the driver's velocity
+    clearance: Float[Leaf, ""]  # m, the least within the frame
+    contact: Bool[Leaf, ""]  # clearance <= 0 in some substep
+    fresh: Bool[Leaf, ""]
+    setbacks: Int[Leaf, ""]
+    ok: Bool[Leaf, ""]
 
 
 def init(params: Params, model: mjx.Model, room: Room, driver: Driver) -> State:
@@ -115,9 +118,10 @@ def set_back(params: Params, room: Room, state: State, driver: Driver) -> State:
     setbacks = state.setbacks + 1
     start = jnp.take(room.starts, setbacks, axis=0, mode="wrap")
     fresh_driver = driver.init(params.controller.driver, jax.random.fold_in(room.key, setbacks))
-    lifted = state.replace(
+    lifted = replace(
+        state,
         data=hexapod.put(state.data, start),
-        controller=state.controller.replace(driver=fresh_driver),
+        controller=replace(state.controller, driver=fresh_driver),
         teacher=braitenberg.init(params.teacher),
         setbacks=setbacks,
         fresh=jnp.ones_like(state.fresh),
@@ -136,7 +140,7 @@ def sense(
     def look(eyes: lgmd.State) -> tuple[lgmd.State, lgmd.Response]:
         frames = camera.render(params.camera, scene, *hexapod.eye_poses(pose))
         opened = _where(state.fresh, controller.open_eyes(params.controller, frames), eyes)
-        seeing, response = controller.see(params.controller, nerves.replace(lgmd=opened), frames)
+        seeing, response = controller.see(params.controller, replace(nerves, lgmd=opened), frames)
         return seeing.lgmd, response
 
     def look_away(eyes: lgmd.State) -> tuple[lgmd.State, lgmd.Response]:
@@ -148,14 +152,14 @@ def sense(
     senses = Senses(
         u=response.u, feed_forward=response.feed_forward, excitation=response.excitation, distances=distances
     )
-    return state.replace(controller=nerves.replace(lgmd=eyes)), senses
+    return replace(state, controller=replace(nerves, lgmd=eyes)), senses
 
 
 def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tuple[State, Float[Array, "2"]]:
     """Let the driver choose the velocity, and the rule (eq. 22, limited) label the frame."""
     teacher, label = braitenberg.step(params.teacher, state.teacher, senses.distances)
     nerves = controller.decide(params.controller, state.controller, senses, driver)
-    return state.replace(controller=nerves, teacher=teacher), label
+    return replace(state, controller=nerves, teacher=teacher), label
 
 
 def move(
@@ -174,7 +178,8 @@ def move(
 
     (data, nerves), clearances = jax.lax.scan(substep, (state.data, state.controller), length=SUBSTEPS)
     clearance = jnp.min(clearances)
-    state = state.replace(
+    state = replace(
+        state,
         data=data,
         controller=nerves,
         frame=state.frame + 1,
@@ -208,7 +213,7 @@ def _record(state: State, senses: Senses, label: Float[Array, "2"], clearance: F
 def _keep_sound(before: State, after: State) -> State:
     """Freeze a robot that fell or went non-finite at its last sound frame, for good; only the clock goes on."""
     ok = before.ok & hexapod.is_sound(after.data)
-    return _where(ok, after, before).replace(ok=ok, frame=after.frame)
+    return replace(_where(ok, after, before), ok=ok, frame=after.frame)
 
 
 def _where(condition: Bool[Array, ""], chosen: Any, otherwise: Any) -> Any:

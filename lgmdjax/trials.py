@@ -9,6 +9,7 @@ Works on host records (`rollout.chunks`) with axes (robot, frame).
 """
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from flax import struct
@@ -104,7 +105,7 @@ def stretches(setbacks: np.ndarray) -> Iterator[tuple[int, int, int]]:
     for robot, count in enumerate(setbacks):
         cuts = np.flatnonzero(np.diff(count)) + 1
         bounds = [0, *cuts.tolist(), len(count)]
-        yield from ((robot, first, last) for first, last in zip(bounds[:-1], bounds[1:], strict=True))
+        yield from ((robot, first, last) for first, last in pairwise(bounds))
 
 
 def poisson_rate(count: int, exposure: float) -> Estimate:

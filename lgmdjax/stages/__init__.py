@@ -26,7 +26,7 @@ def _later(module: str) -> Work:
 STAGES = (
     Stage(name="fit-gait", work=_later("fit_gait")),
     Stage(name="collect", work=_later("collect"), inputs=("fit-gait",)),
-    Stage(name="train", work=_later("train"), inputs=("collect",)),
+    Stage(name="train", work=_later("train"), inputs=("fit-gait", "collect")),
     Stage(name="evaluate", work=_later("evaluate"), inputs=("fit-gait", "collect", "train")),
     Stage(name="report", work=_later("report"), inputs=("fit-gait", "collect", "train", "evaluate")),
 )

@@ -1,6 +1,7 @@
 """What the stages share: one robot put together from the files of a run, and walks of a crowd with a progress bar."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -73,8 +74,8 @@ REPLAY = 4096  # commands of the random driver; a static number, so that one com
 
 def seat(params: simulation.Params, driver: drivers.Driver) -> simulation.Params:
     """Put one of the drivers at the wheel."""
-    crew = params.controller.driver.replace(seat=jnp.asarray(drivers.ALL.index(driver)))
-    return params.replace(controller=params.controller.replace(driver=crew))
+    crew = replace(params.controller.driver, seat=jnp.asarray(drivers.ALL.index(driver)))
+    return replace(params, controller=replace(params.controller, driver=crew))
 
 
 def walks(

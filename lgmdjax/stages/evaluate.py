@@ -12,7 +12,20 @@ from typing import Any
 import jax
 import numpy as np
 
-from lgmdjax import camera, cpg, drivers, episodes, hexapod, lgmd, navigator, rollout, scales, scenes, simulation, trials
+from lgmdjax import (
+    camera,
+    cpg,
+    drivers,
+    episodes,
+    hexapod,
+    lgmd,
+    navigator,
+    rollout,
+    scales,
+    scenes,
+    simulation,
+    trials,
+)
 from lgmdjax.runs import write_json
 from lgmdjax.stages import collect, crew
 

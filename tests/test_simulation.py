@@ -1,0 +1,193 @@
+"""One frame, and walks made of it: mirrored, differentiated, set back, frozen."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lgmdjax import (
+    arena,
+    braitenberg,
+    camera,
+    controller,
+    cpg,
+    drivers,
+    hexapod,
+    laser,
+    lgmd,
+    navigator,
+    rollout,
+    scenes,
+    shaping,
+    simulation,
+)
+
+MIRRORED_LEGS = np.array([5, 4, 3, 2, 1, 0])
+FRAMES = 20
+
+
+def asarray(tree):
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if isinstance(leaf, float) else leaf, tree)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return hexapod.build()
+
+
+@pytest.fixture(scope="module")
+def params():
+    teacher = asarray(braitenberg.Params())
+    everyone = drivers.Anyone(
+        seat=jnp.asarray(0),
+        drivers=(
+            teacher,
+            navigator.create(jax.random.key(3)),
+            drivers.Blind(velocity=jnp.asarray([1.2, 1.2])),
+            drivers.Direct(rule=teacher, gain=jnp.asarray(10.0)),
+            drivers.Replay(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0]])),
+        ),
+    )
+    nerves = controller.Params(
+        lgmd=asarray(lgmd.Params(threshold=0.5, suppression=30.0, smooth=True)),
+        driver=everyone,
+        cpg=asarray(cpg.Params()),
+        shaping=shaping.taught(),
+    )
+    eyes = camera.Params(width=48, height=36, overlap=0.6)
+    return simulation.Params(controller=nerves, teacher=teacher, camera=eyes, laser=asarray(laser.Params()))
+
+
+@pytest.fixture(scope="module")
+def room():
+    """A start half a metre from a box that stands a little to the left."""
+    boxes = arena.place([[0.75, 0.12]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
+    scene = arena.empty_room((5.0, 4.0), boxes=boxes)
+    return simulation.Room(arena=scene, starts=jnp.zeros((1, 3)), key=jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def walk(params, model):
+    """A compiled walk of FRAMES frames from a state, for whoever sits at the wheel."""
+
+    @jax.jit
+    def run(seat, room, state):
+        own = params.controller.replace(driver=params.controller.driver.replace(seat=seat))
+        return rollout.walk(params.replace(controller=own), model, room, state, drivers.ANYONE, FRAMES)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def start(params, model, room):
+    return simulation.init(params, model, room, drivers.ANYONE)
+
+
+def seat(driver):
+    return jnp.asarray(drivers.ALL.index(driver))
+
+
+def mirrored(state: simulation.State) -> simulation.State:
+    """Begin with the other tripod, as the mirrored robot does."""
+    legs = state.controller.cpg
+    other = legs.replace(activation=legs.activation[MIRRORED_LEGS], adaptation=legs.adaptation[MIRRORED_LEGS])
+    return state.replace(controller=state.controller.replace(cpg=other))
+
+
+@pytest.mark.parametrize("driver", [drivers.TEACHER, drivers.DIRECT], ids=lambda driver: driver.name)
+def test_mirror_the_room_and_the_commands_swap(walk, start, room, driver):
+    _, record = walk(seat(driver), room, start)
+    _, image = walk(seat(driver), room.replace(arena=arena.mirror(room.arena)), mirrored(start))
+    for name in ("velocity", "label", "distances", "u", "excitation"):
+        np.testing.assert_allclose(getattr(image, name), getattr(record, name)[:, ::-1], atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(image.position, record.position * [1, -1, 1], atol=1e-6)
+    assert np.ptp(np.asarray(record.velocity), axis=1).max() > 0.1  # it does turn
+
+
+def test_teacher_turns_away_from_the_box_on_its_left(walk, start, room):
+    _, record = walk(seat(drivers.TEACHER), room, start)
+    assert np.all(np.asarray(record.velocity)[:, 1] < np.asarray(record.velocity)[:, 0])
+    np.testing.assert_array_equal(record.velocity, record.label)
+
+
+def test_eyes_are_quiet_at_first_and_see_the_walk_afterwards(walk, start, room):
+    _, record = walk(seat(drivers.BLIND), room, start)
+    np.testing.assert_array_equal(np.asarray(record.u)[0], 0.5)
+    assert np.all(np.asarray(record.u)[5:].max(axis=0) > 0.5)
+
+
+def test_touch_sets_the_robot_back_at_the_next_start(walk, params, model, room):
+    inside = room.replace(starts=jnp.asarray([[0.5, 0.12, 0.0], [-1.0, 1.0, 0.5]]))
+    state = simulation.init(params, model, inside, drivers.ANYONE)
+    _, record = walk(seat(drivers.BLIND), inside, state)
+    assert bool(record.contact[0])
+    assert record.setbacks.tolist() == [0] + [1] * (FRAMES - 1)
+    np.testing.assert_allclose(record.position[1, :2], [-1.0, 1.0], atol=1e-9)
+    np.testing.assert_array_equal(record.u[1], 0.5)  # a new place is no looming
+
+
+def test_robot_that_is_not_finite_is_frozen_and_flagged_and_passes_nothing_on(walk, start, room):
+    sick = start.replace(data=start.data.replace(qvel=start.data.qvel.at[7].set(jnp.nan)))
+    end, record = walk(seat(drivers.BLIND), room, sick)
+    assert record.ok.tolist() == [True] + [False] * (FRAMES - 1)
+    assert np.all(np.isfinite(record.position))
+    assert not bool(end.ok)
+
+
+def test_blind_walk_without_pictures_is_the_same_walk(params, model, start, room, walk):
+    _, seen = walk(seat(drivers.BLIND), room, start)
+    own = params.controller.replace(driver=params.controller.driver.replace(seat=seat(drivers.BLIND)))
+    unseen = params.replace(controller=own)
+    _, record = jax.jit(lambda s: rollout.walk(unseen, model, room, s, drivers.ANYONE, FRAMES, False))(start)
+    np.testing.assert_allclose(record.position, seen.position, atol=1e-9)
+    np.testing.assert_array_equal(record.u, 0.5)
+
+
+def test_one_frame_has_a_gradient_for_every_parameter(params, model, room, start, walk):
+    """Move, sense, decide: reverse mode equals forward mode, finite, and no part is left out."""
+    soft = hexapod.differentiable(model, soft=True)
+    learned = params.controller.driver.drivers[1]
+    state, _ = walk(seat(drivers.LEARNED), room, start)
+    state = state.replace(
+        controller=state.controller.replace(driver=state.controller.driver[1]),
+    )
+
+    def loss(nerves: controller.Params):
+        own = params.replace(controller=nerves)
+        moved, _ = simulation.move(own, soft, room.arena, state)
+        seen, senses = simulation.sense(own, room.arena, moved)
+        decided, label = simulation.decide(own, seen, senses, drivers.LEARNED)
+        return jnp.sum((decided.controller.velocity - jax.lax.stop_gradient(label)) ** 2)
+
+    nerves = params.controller.replace(driver=learned)
+    value, gradient = jax.jit(jax.value_and_grad(loss))(nerves)
+    assert float(value) > 0
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        name = jax.tree_util.keystr(path)
+        assert np.all(np.isfinite(leaf)), name
+        assert np.any(np.asarray(leaf) != 0), name
+    directional = jax.jit(lambda direction: jax.jvp(loss, (nerves,), (direction,))[1])
+    for seed in range(3):
+        generator = np.random.default_rng(seed)
+        direction = jax.tree.map(lambda leaf, luck=generator: jnp.asarray(luck.normal(size=leaf.shape)), nerves)
+        products = jax.tree.map(lambda g, d: jnp.vdot(g, d), gradient, direction)
+        np.testing.assert_allclose(directional(direction), sum(jax.tree.leaves(products)), rtol=1e-6)
+
+
+def test_chunks_of_a_crowd_are_one_walk(params, model):
+    keys = jax.random.split(jax.random.key(1), 2)
+    arenas = [scenes.random_room(key) for key in keys]
+    rooms = rollout.stack(
+        [simulation.Room(arena=a, starts=a.start[None], key=k) for a, k in zip(arenas, keys, strict=True)]
+    )
+    own = params.controller.replace(driver=params.controller.driver.replace(seat=seat(drivers.TEACHER)))
+    crowd = params.replace(controller=own)
+    short = rollout.together(
+        list(rollout.chunks(crowd, model, rooms, drivers.ANYONE, 1.0, draw=False, chunk_seconds=0.4))
+    )
+    assert short.time.shape == (2, 30)
+    np.testing.assert_allclose(short.time[0], np.arange(30) / 30)
+    one = jax.tree.map(lambda leaf: leaf[1], rooms)
+    state = simulation.init(crowd, model, one, drivers.ANYONE)
+    _, alone = jax.jit(lambda s: rollout.walk(crowd, model, one, s, drivers.ANYONE, 30, False))(state)
+    np.testing.assert_allclose(short.position[1], alone.position, atol=1e-8)
