@@ -2,7 +2,8 @@
 
 Every function draws one figure for a page about 18 cm wide, on the Agg canvas and without pyplot, so that no
 window system and no global figure is involved. Left is blue and right is orange throughout, in the palette of
-Okabe & Ito, which stays apart for colour-blind eyes.
+Okabe & Ito, which stays apart for colour-blind eyes. The file is long because it is nine times the same kind of
+thing: the functions share a style and nothing else.
 
 | figure here    | of the paper | shows                                                   |
 | -------------- | ------------ | ------------------------------------------------------- |
