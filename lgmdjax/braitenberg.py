@@ -17,7 +17,7 @@ Source: Cizek & Faigl, sec. 4.1, 4.2; Braitenberg 1986. Pairs are (left, right);
 Eq. 22 as printed is `rule`. It asks for velocities that no gait can make, and straight in front of a flat
 wall it walks on, faster and faster, because both sides are equally near. `step` therefore departs from it
 twice: it keeps to the gait's range in the way that saves most of the turn (`limit`), and when something is
-near it turns at least so much, and goes on turning the way it began while both sides are nearly equally near.
+near it turns at least so much, and goes on turning the way it turns while both sides are nearly equally near.
 
 Gradient: exact almost everywhere; the side of the turn has none.
 """
@@ -57,7 +57,7 @@ class Params:
 
 @struct.dataclass(kw_only=True)
 class State:
-    """The way of the last turn: 1 left, -1 right, 0 none yet."""
+    """The way that the robot turns: 1 left, -1 right, 0 neither."""
 
     side: Float[Array, ""]
 
@@ -124,7 +124,17 @@ def step(params: Params, state: State, distances: Float[Array, "2"]) -> tuple[St
     strength = jnp.maximum(side * turn, danger * params.full_turn)
     mean = jnp.mean(velocity)
     limited = limit(params, mean + side * strength * jnp.asarray([-0.5, 0.5], velocity.dtype))
-    return State(side=side), limited
+    return watch(params, limited), limited
+
+
+def watch(params: Params, velocity: Float[Array, "2"]) -> State:
+    """Take note of how the robot is being driven, by the teacher or by somebody else.
+
+    A tie is then broken by the turn that is under way, which whoever drives knows of: a pupil can only learn from a
+    teacher whose labels hang on what both of them can tell.
+    """
+    turn = velocity[1] - velocity[0]
+    return State(side=jnp.where(jnp.abs(turn) > params.steady, jnp.sign(turn), jnp.zeros_like(turn)))
 
 
 def check(params: Params) -> None:
@@ -134,7 +144,7 @@ def check(params: Params) -> None:
             raise InputError(
                 f"braitenberg {name}: expected a finite number, got {value}; see braitenberg.Params"
             )
-    for name in ("base", "gain_2a", "gain_3b", "close", "full_turn", "symmetry"):
+    for name in ("base", "gain_2a", "gain_3b", "close", "full_turn", "symmetry", "steady"):
         if getattr(params, name) < 0:
             raise InputError(f"braitenberg {name}: expected a number >= 0, got {getattr(params, name)}")
     for low, high in (("slowest", "fastest"), ("close", "near")):

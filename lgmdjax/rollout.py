@@ -89,7 +89,7 @@ STARTS = 32  # places where a room's robot is put down, one after the other
 
 
 @partial(jax.jit, static_argnames="count")
-def random_rooms(key: Array, count: int, density: float = 0.25) -> Room:
+def random_rooms(key: Array, count: int, density: float = 0.15) -> Room:
     """Draw rooms that a key alone decides, each with its starts; the same key and index give the same room."""
 
     def room(key: Array) -> Room:

@@ -58,7 +58,8 @@ class Evaluate:
 
     eyes: Eyes
     robots: int
-    seconds: float
+    seconds: float  # of each robot, in the unseen rooms
+    testing_seconds: float  # of each robot, in the testing room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,21 +76,21 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "fit-gait": FitGait(steps=300, seconds=6),
         "collect": Collect(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=10),
         "train": Train(eyes=_SMALL, epochs=5, rounds=1, round_epochs=5, robots=4, round_seconds=10),
-        "evaluate": Evaluate(eyes=_SMALL, robots=4, seconds=10),
+        "evaluate": Evaluate(eyes=_SMALL, robots=4, seconds=10, testing_seconds=10),
         "report": Report(video_seconds=2),
     },
     "quick": {
         "fit-gait": FitGait(steps=3000, seconds=20),
-        "collect": Collect(eyes=_QUICK, robots=16, episodes=4, seconds=60, calibration_seconds=20),
-        "train": Train(eyes=_QUICK, epochs=60, rounds=2, round_epochs=40, robots=16, round_seconds=60),
-        "evaluate": Evaluate(eyes=_QUICK, robots=16, seconds=60),
+        "collect": Collect(eyes=_QUICK, robots=16, episodes=1, seconds=60, calibration_seconds=15),
+        "train": Train(eyes=_QUICK, epochs=25, rounds=3, round_epochs=15, robots=16, round_seconds=60),
+        "evaluate": Evaluate(eyes=_QUICK, robots=16, seconds=90, testing_seconds=30),
         "report": Report(video_seconds=10),
     },
     "paper": {
         "fit-gait": FitGait(steps=6000, seconds=20),
         "collect": Collect(eyes=_PAPER, robots=16, episodes=1, seconds=56.25, calibration_seconds=30),
         "train": Train(eyes=_PAPER, epochs=1000, rounds=2, round_epochs=200, robots=16, round_seconds=60),
-        "evaluate": Evaluate(eyes=_PAPER, robots=16, seconds=270),
+        "evaluate": Evaluate(eyes=_PAPER, robots=16, seconds=180, testing_seconds=270),
         "report": Report(video_seconds=30),
     },
 }

@@ -202,7 +202,11 @@ def _put(prisms: Prisms, index: Array, prism: Prisms, stands: Bool[Array, ""]) -
 
 
 def textured(arena: Arena, key: Array | None = None) -> Arena:
-    """Draw textures for everything in a room: obstacles stand out, walls are bright, floors duller."""
+    """Draw textures for everything in a room: busy obstacles and walls, a nearly plain floor.
+
+    The LGMD takes nearness from how much moves, so it is told apart from contrast only where things are about
+    equally busy; and the floor, always nearest, would drown what it says of everything else.
+    """
     boxes, cylinders = arena.boxes, arena.cylinders
     first, second = boxes.yaw.size, boxes.yaw.size + cylinders.yaw.size
     draws = _uniform(jax.random.key(0) if key is None else key, (second + 6, 4))
@@ -211,13 +215,13 @@ def textured(arena: Arena, key: Array | None = None) -> Arena:
         least, most = jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
         return least + draws * (most - least)
 
-    things = between(draws[:second], (40.0, 0.5, 0.0, 0.10), (190.0, 1.0, 2.0 * jnp.pi, 0.40))
+    things = between(draws[:second], (100.0, 0.6, 0.0, 0.15), (160.0, 0.8, 2.0 * jnp.pi, 0.35))
     return dataclasses.replace(
         arena,
         boxes=dataclasses.replace(boxes, texture=things[:first]),
         cylinders=dataclasses.replace(cylinders, texture=things[first:]),
-        wall_texture=between(draws[second:-2], (130.0, 0.2, 0.0, 0.3), (220.0, 0.7, 2.0 * jnp.pi, 1.0)),
-        floor_texture=between(draws[-2], (80.0, 0.2, 0.0, 0.2), (150.0, 0.6, 2.0 * jnp.pi, 0.6)),
+        wall_texture=between(draws[second:-2], (120.0, 0.5, 0.0, 0.3), (170.0, 0.7, 2.0 * jnp.pi, 0.6)),
+        floor_texture=between(draws[-2], (110.0, 0.05, 0.0, 0.25), (150.0, 0.12, 2.0 * jnp.pi, 0.45)),
         sky=200.0 + 50.0 * draws[-1, 0],
     )
 

@@ -157,8 +157,9 @@ def sense(
 
 def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tuple[State, Float[Array, "2"]]:
     """Let the driver choose the velocity, and the rule (eq. 22, limited) label the frame."""
-    teacher, label = braitenberg.step(params.teacher, state.teacher, senses.distances)
+    _, label = braitenberg.step(params.teacher, state.teacher, senses.distances)
     nerves = controller.decide(params.controller, state.controller, senses, driver)
+    teacher = braitenberg.watch(params.teacher, nerves.velocity)
     return replace(state, controller=nerves, teacher=teacher), label
 
 

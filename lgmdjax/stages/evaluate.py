@@ -81,7 +81,8 @@ def _walk(
     if not writer.chunks:
         sees = driver in (drivers.LEARNED, drivers.DIRECT)
         label = f"evaluate: {driver.name}, {folder.parent.name} room"
-        chunks = crew.walks(crew.seat(params, driver), model, rooms, settings.seconds, label, draw=sees)
+        seconds = settings.testing_seconds if folder.parent.name == "testing" else settings.seconds
+        chunks = crew.walks(crew.seat(params, driver), model, rooms, seconds, label, draw=sees)
         writer.write(rollout.together(list(chunks)), episode=0, rooms=range(settings.robots), seed=seed)
     return batched(episodes.read(folder))
 

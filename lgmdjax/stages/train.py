@@ -53,7 +53,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
     minutes = {name: sum(map(len, some)) / FRAME_RATE / 60 for name, some in sets.items()}
     table = training.table({variant: fit.best for variant, fit in fits.items()}, sets)
     write_json(folder / "training.json", {"curves": curves, "table": table, "minutes": minutes})
-    learned = fits["lstm"].best
+    learned = training.enliven(fits["lstm"].best, second)
     navigator.save(
         folder / "controller.safetensors", learned, header | {"seed": seed, "training": dataclasses.asdict(settings)}
     )
@@ -77,7 +77,7 @@ def _own_walks(
         )
         episode = OWN_WALKS + number
         params = crew.robot(
-            inputs["fit-gait"], settings.eyes, collect.load_detector(inputs["collect"]), crew.everyone(fit.best)
+            inputs["fit-gait"], settings.eyes, collect.load_detector(inputs["collect"]), crew.everyone(training.enliven(fit.best, test))
         )
         rooms = collect.rooms_of(seed, episode, settings.robots)
         label = f"train: its own walk {number + 1} of {settings.rounds}"
