@@ -86,7 +86,7 @@ def step_lengths(record: Record, cycle_time: float) -> np.ndarray:
 
 def yaw_rates(record: Record, cycle_time: float) -> np.ndarray:
     """Measure the yaw rate of the trunk, averaged over one gait cycle [rad/s]; shape (robots, frames)."""
-    yaw, setbacks = np.unwrap(yaws(record.quaternion), axis=1), np.asarray(record.setbacks)
+    yaw, setbacks = np.unwrap(yaws(np.asarray(record.quaternion)), axis=1), np.asarray(record.setbacks)
     rates = np.zeros(yaw.shape)
     for robot, first, last in stretches(setbacks):
         if last - first > 1:

@@ -1,5 +1,7 @@
 """One frame, and walks made of it: mirrored, differentiated, set back, frozen."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -90,8 +92,8 @@ def seat(driver):
 def mirrored(state: simulation.State) -> simulation.State:
     """Begin with the other tripod, as the mirrored robot does."""
     legs = state.controller.cpg
-    other = legs.replace(activation=legs.activation[MIRRORED_LEGS], adaptation=legs.adaptation[MIRRORED_LEGS])
-    return state.replace(controller=state.controller.replace(cpg=other))
+    other = replace(legs, activation=legs.activation[MIRRORED_LEGS], adaptation=legs.adaptation[MIRRORED_LEGS])
+    return replace(state, controller=replace(state.controller, cpg=other))
 
 
 @pytest.mark.parametrize("driver", [drivers.TEACHER, drivers.DIRECT], ids=lambda driver: driver.name)

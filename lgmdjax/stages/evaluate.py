@@ -50,10 +50,10 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Evaluate, se
         for place, records in walked.items()
     }
     write_json(folder / "evaluation.json", scores)
-    np.savez(folder / "trajectories.npz", **_trajectories(walked))
+    np.savez(folder / "trajectories.npz", allow_pickle=False, **_trajectories(walked))
     shown = _one(walked["testing"]["learned"], _liveliest(walked["testing"]["learned"]))
-    np.savez(folder / "walk.npz", **{name: getattr(shown, name) for name in episodes.FIELDS})
-    np.savez(folder / "layers.npz", **_layers(detector, settings.eyes, shown))
+    np.savez(folder / "walk.npz", allow_pickle=False, **{name: getattr(shown, name) for name in episodes.FIELDS})
+    np.savez(folder / "layers.npz", allow_pickle=False, **_layers(detector, settings.eyes, shown))
 
 
 def load_drivers(train: Path) -> drivers.Anyone:

@@ -27,7 +27,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.FitGait, see
     networks = {literal: _teach(body, settings, seed, literal) for literal in (False, True)}
     shaping.save(folder / "shaping.safetensors", networks[False], {"steps": settings.steps, "seed": seed})
     rhythm = cpg.Params()
-    np.savez(folder / "cpg.npz", **_onset(rhythm, seed))
+    np.savez(folder / "cpg.npz", allow_pickle=False, **_onset(rhythm, seed))
     courses = {
         (velocity, literal): treadmill.targets(
             rhythm, networks[literal], jnp.asarray(velocity), steps=round(settings.seconds / treadmill.STEP)
@@ -41,7 +41,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.FitGait, see
         for (name, course), walk in zip(courses.items(), mjx, strict=True)
     }
     write_json(folder / "gait.json", _summary(walks, float(rhythm.cycle_time)))
-    np.savez(folder / "foot.npz", **_foot_paths(body, courses, walks, float(rhythm.cycle_time)))
+    np.savez(folder / "foot.npz", allow_pickle=False, **_foot_paths(body, courses, walks, float(rhythm.cycle_time)))
 
 
 def _teach(body: Any, settings: scales.FitGait, seed: int, literal: bool) -> shaping.Params:

@@ -32,7 +32,7 @@ SHOWN = 60.0  # s, of fig. 12
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed: int) -> None:
     """Fit and walk in turns, then fit every variant on all walks, and keep the paper's as the controller."""
     recorded = episodes.stretches(episodes.read(inputs["collect"] / "episodes"))
-    np.savez(folder / "baselines.npz", **_baselines(recorded))
+    np.savez(folder / "baselines.npz", allow_pickle=False, **_baselines(recorded))
     walks, header = recorded, episodes.parameters(inputs["collect"] / "episodes")
     for number in range(settings.rounds):
         walks = walks + _own_walks(folder, inputs, settings, seed, number, walks)
@@ -57,7 +57,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
     navigator.save(
         folder / "controller.safetensors", learned, header | {"seed": seed, "training": dataclasses.asdict(settings)}
     )
-    np.savez(folder / "prediction.npz", **_prediction(learned, unseen))
+    np.savez(folder / "prediction.npz", allow_pickle=False, **_prediction(learned, unseen))
 
 
 def _own_walks(
@@ -76,9 +76,9 @@ def _own_walks(
             checkpoints=folder / "checkpoints" / f"round-{number}",
         )
         episode = OWN_WALKS + number
-        params = crew.robot(
-            inputs["fit-gait"], settings.eyes, collect.load_detector(inputs["collect"]), crew.everyone(training.enliven(fit.best, test))
-        )
+        detector = collect.load_detector(inputs["collect"])
+        learned = crew.everyone(training.enliven(fit.best, test))
+        params = crew.robot(inputs["fit-gait"], settings.eyes, detector, learned)
         rooms = collect.rooms_of(seed, episode, settings.robots)
         label = f"train: its own walk {number + 1} of {settings.rounds}"
         chunks = crew.walks(
