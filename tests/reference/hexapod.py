@@ -1,0 +1,51 @@
+"""The robot by other means: C MuJoCo with the same obstacles, and a tripod gait from NumPy and the leg's triangle."""
+
+import mujoco
+import numpy as np
+
+# robot.md: m and degrees, in the order left front, left middle, left rear, right rear, right middle, right front
+MOUNTS = np.array([(0.125, 0.062), (0, 0.1), (-0.125, 0.062), (-0.125, -0.062), (0, -0.1), (0.125, -0.062)])
+MOUNT_YAWS = np.radians([45, 90, 135, -135, -90, -45])
+COXA, FEMUR, TIBIA = 0.052, 0.066, 0.133
+
+
+def twin(model: mujoco.MjModel, placed) -> mujoco.MjModel:
+    """Give C MuJoCo the shapes that an `mjx.Model` has been given, with the bounds that its broad phase needs."""
+    for name in ("geom_pos", "geom_size", "geom_quat"):
+        getattr(model, name)[:] = np.asarray(getattr(placed, name))
+    for i in range(model.ngeom):
+        half = model.geom_size[i].copy()
+        if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            half = np.array([half[0], half[0], half[0] + half[1]])
+        elif model.geom_type[i] != mujoco.mjtGeom.mjGEOM_BOX:
+            continue
+        model.geom_sameframe[i] = 0  # it may be turned now
+        model.geom_aabb[i] = [0, 0, 0, *half]
+        model.geom_rbound[i] = np.linalg.norm(half) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX else half[2]
+    return model
+
+
+def angles(feet: np.ndarray) -> np.ndarray:
+    """Solve the triangle hip, knee, foot: joint angles (6, 3) of feet (6, 3) in the trunk's frame, knee up."""
+    x, y = (feet[:, :2] - MOUNTS).T
+    coxa = (np.arctan2(y, x) - MOUNT_YAWS + np.pi) % (2 * np.pi) - np.pi
+    reach, drop = np.hypot(x, y) - COXA, -feet[:, 2]
+    span = np.hypot(reach, drop)
+    knee = np.arccos((FEMUR**2 + TIBIA**2 - span**2) / (2 * FEMUR * TIBIA))
+    femur = np.arccos((FEMUR**2 + span**2 - TIBIA**2) / (2 * FEMUR * span)) - np.arctan2(drop, reach)
+    return np.stack([coxa, femur, knee - np.pi / 2], axis=-1)
+
+
+def tripod(steps: int, velocity: tuple[float, float], homes: np.ndarray) -> np.ndarray:
+    """Walk at (left, right) [m/s] about the feet's homes [m]: joint angles (steps, 6, 3), a row each 1/180 s."""
+    sides = np.repeat(velocity, 3)
+    rows = []
+    for time in np.arange(steps) / 180:
+        phase = (time + np.array([0.0, 0.5] * 3)) % 1.0  # of a cycle of 1 s, the first half of it on the floor
+        swing = np.clip(2 * phase - 1, 0, 1)
+        along = np.where(phase < 0.5, 0.5 - 2 * phase, swing - np.sin(2 * np.pi * swing) / (2 * np.pi) - 0.5)
+        feet = homes.copy()
+        feet[:, 0] += along * sides * 0.5
+        feet[:, 2] += 0.01 * (1 - np.cos(2 * np.pi * swing))
+        rows.append(angles(feet))
+    return np.stack(rows)
