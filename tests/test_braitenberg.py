@@ -109,6 +109,14 @@ def test_in_front_of_a_wall_it_turns_and_goes_on_turning():
     assert after == PARAMS.first_side and right > left
 
 
+def test_a_tie_is_broken_by_the_turn_under_way():
+    """Whoever drives: watched to the right it goes on to the right, though the left is a little farther."""
+    for driven, side in (([2.0, -1.0], -1), ([-1.0, 2.0], 1), ([1.2, 1.3], 0)):
+        assert braitenberg.watch(PARAMS, jnp.asarray(driven)).side == side
+    _, velocity = step(PARAMS, braitenberg.watch(PARAMS, jnp.asarray([2.0, 0.5])), jnp.asarray([0.42, 0.4]))
+    assert velocity[0] - velocity[1] > 2
+
+
 def test_a_clearly_nearer_side_turns_it_round():
     after, (left, right) = teach((0.4, 0.9), side=1.0)
     assert after == -1 and left - right >= 2
