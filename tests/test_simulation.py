@@ -62,8 +62,8 @@ def params():
 
 @pytest.fixture(scope="module")
 def room():
-    """A start half a metre from a box that stands a little to the left."""
-    boxes = arena.place([[0.75, 0.12]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
+    """A start half a metre from a box that stands to the left; straight ahead it would be a tie, which has a side."""
+    boxes = arena.place([[0.75, 0.4]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
     scene = arena.empty_room((5.0, 4.0), boxes=boxes)
     return simulation.Room(arena=scene, starts=jnp.zeros((1, 3)), key=jax.random.key(0))
 
@@ -102,7 +102,7 @@ def test_mirror_the_room_and_the_commands_swap(walk, start, room, driver):
     _, image = walk(seat(driver), room.replace(arena=arena.mirror(room.arena)), mirrored(start))
     for name in ("velocity", "label", "distances", "u", "excitation"):
         np.testing.assert_allclose(getattr(image, name), getattr(record, name)[:, ::-1], atol=1e-5, err_msg=name)
-    np.testing.assert_allclose(image.position, record.position * [1, -1, 1], atol=1e-6)
+    np.testing.assert_allclose(image.position, np.asarray(record.position) * [1, -1, 1], atol=1e-6)
     assert np.ptp(np.asarray(record.velocity), axis=1).max() > 0.1  # it does turn
 
 
@@ -119,7 +119,7 @@ def test_eyes_are_quiet_at_first_and_see_the_walk_afterwards(walk, start, room):
 
 
 def test_touch_sets_the_robot_back_at_the_next_start(walk, params, model, room):
-    inside = room.replace(starts=jnp.asarray([[0.5, 0.12, 0.0], [-1.0, 1.0, 0.5]]))
+    inside = room.replace(starts=jnp.asarray([[0.5, 0.4, 0.0], [-1.0, 1.0, 0.5]]))
     state = simulation.init(params, model, inside, drivers.ANYONE)
     _, record = walk(seat(drivers.BLIND), inside, state)
     assert bool(record.contact[0])
@@ -143,37 +143,6 @@ def test_blind_walk_without_pictures_is_the_same_walk(params, model, start, room
     _, record = jax.jit(lambda s: rollout.walk(unseen, model, room, s, drivers.ANYONE, FRAMES, False))(start)
     np.testing.assert_allclose(record.position, seen.position, atol=1e-9)
     np.testing.assert_array_equal(record.u, 0.5)
-
-
-def test_one_frame_has_a_gradient_for_every_parameter(params, model, room, start, walk):
-    """Move, sense, decide: reverse mode equals forward mode, finite, and no part is left out."""
-    soft = hexapod.differentiable(model, soft=True)
-    learned = params.controller.driver.drivers[1]
-    state, _ = walk(seat(drivers.LEARNED), room, start)
-    state = state.replace(
-        controller=state.controller.replace(driver=state.controller.driver[1]),
-    )
-
-    def loss(nerves: controller.Params):
-        own = params.replace(controller=nerves)
-        moved, _ = simulation.move(own, soft, room.arena, state)
-        seen, senses = simulation.sense(own, room.arena, moved)
-        decided, label = simulation.decide(own, seen, senses, drivers.LEARNED)
-        return jnp.sum((decided.controller.velocity - jax.lax.stop_gradient(label)) ** 2)
-
-    nerves = params.controller.replace(driver=learned)
-    value, gradient = jax.jit(jax.value_and_grad(loss))(nerves)
-    assert float(value) > 0
-    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
-        name = jax.tree_util.keystr(path)
-        assert np.all(np.isfinite(leaf)), name
-        assert np.any(np.asarray(leaf) != 0), name
-    directional = jax.jit(lambda direction: jax.jvp(loss, (nerves,), (direction,))[1])
-    for seed in range(3):
-        generator = np.random.default_rng(seed)
-        direction = jax.tree.map(lambda leaf, luck=generator: jnp.asarray(luck.normal(size=leaf.shape)), nerves)
-        products = jax.tree.map(lambda g, d: jnp.vdot(g, d), gradient, direction)
-        np.testing.assert_allclose(directional(direction), sum(jax.tree.leaves(products)), rtol=1e-6)
 
 
 def test_chunks_of_a_crowd_are_one_walk(params, model):
