@@ -30,6 +30,10 @@ _FAR = 1.0e3
 """What is farther away [m] is shaded as if it were here."""
 
 
+_BACK = 0.97
+"""Walls count as farther away, so that what touches them is not cut by them within a pixel of its outline."""
+
+
 class Rays(NamedTuple):
     """One ray a pixel, and how it turns from pixel to pixel."""
 
@@ -38,8 +42,14 @@ class Rays(NamedTuple):
     d_v: Vector
     level_square: Array
     """d_x^2 + d_y^2."""
+    width: Array
+    """w of (d_x, d_y) across upright edges."""
     across: Pair
     """(d_x, d_y)/w for upright edges: times a plane's unit normal, the margin in pixels."""
+    rightward: Pair
+    """Columns and rows to the right, across upright edges, for a pixel of margin."""
+    turn: Pair
+    """What that adds to d_x and d_y."""
 
 
 class Layer(NamedTuple):
@@ -49,6 +59,8 @@ class Layer(NamedTuple):
     """1/t, by which layers are ordered; -1: not there."""
     cover: Array
     """a."""
+    shift: Pair
+    """Columns and rows from the middle of the pixel to that of the part that is covered."""
     s: Vector
     centre: Pair
     """Where the texture's origin is, from the eye [m]."""
@@ -58,28 +70,53 @@ class Layer(NamedTuple):
 def rays(d: Vector, d_u: Vector, d_v: Vector) -> Rays:
     """Complete rays given by their directions and how these change."""
     level_square = d[0] * d[0] + d[1] * d[1] + 1e-12
-    width = _width(d[0] * d_u[1] - d[1] * d_u[0], d[0] * d_v[1] - d[1] * d_v[0])
-    per_pixel = _once(jnp.sqrt(level_square) / width)
-    return Rays(d, d_u, d_v, level_square, (d[0] * per_pixel, d[1] * per_pixel))
+    m_u, m_v = d[1] * d_u[0] - d[0] * d_u[1], d[1] * d_v[0] - d[0] * d_v[1]
+    width = _width(m_u, m_v)
+    inverse = _once(1.0 / width)
+    per_pixel = _once(jnp.sqrt(level_square)) * inverse
+    across, (right_u, right_v) = (d[0] * per_pixel, d[1] * per_pixel), (m_u * inverse, m_v * inverse)
+    turn = right_u * d_u[0] + right_v * d_v[0], right_u * d_u[1] + right_v * d_v[1]
+    return Rays(d, d_u, d_v, level_square, width, across, (right_u, right_v), turn)
 
 
 def draw(arena: Arena, eye: Array, pixels: Rays, prisms: list[Silhouette], bands: int) -> Array:
-    """Blend the two nearest layers of every pixel over the mean grey of what the room has behind them."""
+    """Blend the two nearest layers of every pixel over the mean grey of the third and of what is behind that."""
     room = _room(arena, eye, pixels)
+    background = room.first.nearness
     first, second = room.first, room.second
+    third = _Plain(background, jnp.zeros_like(background), jnp.zeros_like(background))
     for prism in prisms:
-        first, second = _insert(_prism(prism, pixels), first, second)
-    behind_one = jnp.where(first.nearness > room.first.nearness, room.behind_one, room.behind_none)
-    rest = jnp.where(second.nearness > room.first.nearness, room.behind_two, behind_one)
+        first, second, third = _insert(_prism(prism, pixels), first, second, third)
+    behind_two = jnp.where(second.nearness > background, room.behind_two, room.behind_one)
+    rest = jnp.where(third.nearness > background, room.behind_three, behind_two)
+    rest = rest + third.cover * (third.grey - rest)
+    # What the first layer leaves of a pixel has its middle opposite.
+    opposite = _once(-first.cover / (1.001 - first.cover))
+    shift = first.shift[0] * opposite, first.shift[1] * opposite
+    second = second._replace(shift=shift)
     nearer, farther = (_shade(arena.handedness, eye, pixels, layer, bands) for layer in (first, second))
     return rest + second.cover * (1.0 - first.cover) * (farther - rest) + first.cover * (nearer - rest)
 
 
-def _insert(layer: Layer, first: Layer, second: Layer) -> tuple[Layer, Layer]:
-    """Keep the two nearest of three layers."""
+class _Plain(NamedTuple):
+    """A layer without its texture: the third counts in few pixels."""
+
+    nearness: Array
+    cover: Array
+    grey: Array
+
+
+def _insert(layer: Layer, first: Layer, second: Layer, third: _Plain) -> tuple[Layer, Layer, _Plain]:
+    """Keep the three nearest of four layers."""
     is_first, is_second = layer.nearness > first.nearness, layer.nearness > second.nearness
+    is_third = layer.nearness > third.nearness
+    loser = choose(is_second, _plain(second), _plain(layer))
     runner_up = choose(is_first, first, layer)
-    return choose(is_first, layer, first), choose(is_second, runner_up, second)
+    return choose(is_first, layer, first), choose(is_second, runner_up, second), choose(is_third, loser, third)
+
+
+def _plain(layer: Layer) -> _Plain:
+    return _Plain(layer.nearness, layer.cover, layer.texture.brightness)
 
 
 def _prism(prism: Silhouette, pixels: Rays) -> Layer:
@@ -87,43 +124,51 @@ def _prism(prism: Silhouette, pixels: Rays) -> Layer:
     d, (across_x, across_y) = pixels.d, pixels.across
     left = _clip(prism.left[0] * across_x + prism.left[1] * across_y + prism.open)
     right = _clip(prism.right[0] * across_x + prism.right[1] * across_y + prism.open)
-    near, far = _sides(prism, pixels)
+    by_side = 0.5 * (right - left)
+    near, far = _sides(prism, pixels, by_side)
     side = _slopes(near, pixels)
     last = _slopes(choose(prism.lid != 0, far, near), pixels)
-    to_lid = _clip(prism.upward * _rise(prism.lid_end, last, pixels) + prism.lid_open)
-    to_other = _clip(prism.other_open - prism.upward * _rise(prism.other_end, side, pixels))
+    lid_rise, lid_shift = _rise(prism.lid_end, last, pixels)
+    other_rise, other_shift = _rise(prism.other_end, side, pixels)
+    to_lid = _clip(prism.upward * lid_rise + prism.lid_open)
+    to_other = _clip(prism.other_open - prism.upward * other_rise)
+    by_lid_end, by_other_end = 0.5 * prism.upward * (1.0 - to_lid), 0.5 * prism.upward * (to_other - 1.0)
+    shift_u = by_lid_end * lid_shift[0] + by_other_end * other_shift[0] + by_side * pixels.rightward[0]
+    shift_v = by_lid_end * lid_shift[1] + by_other_end * other_shift[1] + by_side * pixels.rightward[1]
     cover = jnp.maximum(left + right - 1.0, 0.0) * jnp.maximum(to_lid + to_other - 1.0, 0.0)
     on_lid = prism.lid * d[2]
     by_lid = on_lid < side[0] + prism.lid_bias
     s = (jnp.where(by_lid, 0.0, near[0]), jnp.where(by_lid, 0.0, near[1]), jnp.where(by_lid, prism.lid, 0.0))
     nearness = jnp.where(cover > 0, jnp.where(by_lid, on_lid, side[0]), -1.0)
-    return Layer(nearness, cover, s, prism.centre, prism.texture)
+    return Layer(nearness, cover, (shift_u, shift_v), s, prism.centre, prism.texture)
 
 
-def _sides(prism: Silhouette, pixels: Rays) -> tuple[Pair, Pair]:
-    """s of the sides by which each ray would enter and leave, were the prism endless upward and downward."""
-    x, y, _ = pixels.d
+def _sides(prism: Silhouette, pixels: Rays, shift: Array) -> tuple[Pair, Pair]:
+    """s of the sides by which rays enter and leave, were the prism endless upward and downward.
+
+    The rays are those through the middle of what is covered of a pixel, `shift` to the right of its own.
+    """
+    x, y = pixels.d[0] + shift * pixels.turn[0], pixels.d[1] + shift * pixels.turn[1]
     near_x, near_y, (c, s) = prism.near_x, prism.near_y, prism.axis
     near = choose((near_x[0] - near_y[0]) * x + (near_x[1] - near_y[1]) * y < 0, near_x, near_y)
     along, aside = c * x + s * y, c * y - s * x
     far_x, far_y = jnp.where(along > 0, *prism.far_x), jnp.where(aside > 0, *prism.far_y)
     far = choose(far_x * along > far_y * aside, (far_x * c, far_x * s), (-far_y * s, far_y * c))
-    near_round, far_round = _round_sides(prism, pixels)
+    near_round, far_round = _round_sides(prism, x, y, pixels.width)
     is_round = prism.round > 0
     return choose(is_round, near_round, near), choose(is_round, far_round, far)
 
 
-def _round_sides(prism: Silhouette, pixels: Rays) -> tuple[Pair, Pair]:
+def _round_sides(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[Pair, Pair]:
     """s of the planes that touch a cylinder where a ray enters and leaves it: o/c +- ((d.o) o/c - d)/q.
 
-    q^2 = (d.o)^2 - c d^2, taken as r^2 d^2 - (o x d)^2, which keeps its digits. Rays that miss get the limb's o/c.
+    q^2 = (d.o)^2 - c d^2, taken as r^2 d^2 - (o x d)^2, which keeps its digits, and not let below what it is a tenth
+    of a pixel inside the limb, where the side turns away without end.
     """
-    x, y, _ = pixels.d
     (o_x, o_y), (p_x, p_y) = prism.centre, prism.polar
     moment = o_x * y - o_y * x
-    q_square = prism.radius_square * pixels.level_square - moment * moment
-    least = 1e-4 * prism.radius_square * pixels.level_square + 1e-12
-    inverse = jnp.where(q_square > least, lax.rsqrt(jnp.maximum(q_square, least)), 0.0)
+    q_square = prism.radius_square * (x * x + y * y) - moment * moment
+    inverse = lax.rsqrt(jnp.maximum(q_square, 0.2 * prism.limb * width + 1e-12))
     b = o_x * x + o_y * y
     e_x, e_y = (b * p_x - x) * inverse, (b * p_y - y) * inverse
     return (p_x + e_x, p_y + e_y), (p_x - e_x, p_y - e_y)
@@ -135,15 +180,16 @@ def _slopes(s: Pair, pixels: Rays) -> Vector:
     return x, y, z
 
 
-def _rise(z: Array, slopes: Vector, pixels: Rays) -> Array:
-    """Margin in pixels by which rays pass below the height z on a face: m = z/t - d_z."""
+def _rise(z: Array, slopes: Vector, pixels: Rays) -> tuple[Array, Pair]:
+    """Margin in pixels by which rays pass below the height z on a face, m = z/t - d_z, and the way to more of it."""
     m, m_u, m_v = (z * a - d[2] for a, d in zip(slopes, (pixels.d, pixels.d_u, pixels.d_v), strict=True))
-    return m / _width(m_u, m_v)
+    inverse = _once(1.0 / _width(m_u, m_v))
+    return m * inverse, (m_u * inverse, m_v * inverse)
 
 
 def _width(m_u: Array, m_v: Array) -> Array:
     m_u, m_v = jnp.abs(m_u), jnp.abs(m_v)
-    return jnp.maximum(m_u, m_v) + 0.5 * jnp.minimum(m_u, m_v) + 1e-9
+    return jnp.maximum(m_u, m_v) + 0.2 * jnp.minimum(m_u, m_v) + 1e-9
 
 
 class _Room(NamedTuple):
@@ -151,12 +197,12 @@ class _Room(NamedTuple):
 
     first: Layer
     second: Layer
-    behind_none: Array
-    """Grey behind both layers."""
     behind_one: Array
-    """Mean grey behind the first one."""
+    """Grey behind both layers, where at most one prism is before them."""
     behind_two: Array
-    """Mean grey of everything."""
+    """Mean grey behind the first layer, if two prisms are."""
+    behind_three: Array
+    """Mean grey of the room, if three are."""
 
 
 def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
@@ -165,8 +211,9 @@ def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
     wall_s, other_s = choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)
     slopes = _slopes(wall_s, pixels)
     part = _part_of_nearer(wall_s, other_s, pixels)
-    floor = _clip(0.5 + _rise(-eye[2], slopes, pixels))
-    sky = _clip(0.5 - _rise(arena.wall_height - eye[2], slopes, pixels))
+    floor_rise, floor_shift = _rise(-eye[2], slopes, pixels)
+    top_rise, top_shift = _rise(arena.wall_height - eye[2], slopes, pixels)
+    floor, sky = _clip(0.5 + floor_rise), _clip(0.5 - top_rise)
     wall = jnp.maximum(1.0 - floor - sky, 0.0)
 
     rows = texture.prepare(arena.wall_texture)
@@ -174,12 +221,15 @@ def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
     wall_row, other_row = choose(by_x, x_row, y_row), choose(by_x, y_row, x_row)
     floor_row = texture.prepare(arena.floor_texture)
     floor_first = floor > 0.5
-    # The floor hides nothing that stands in the room.
-    nearness = jnp.where(floor_first, 0.0, slopes[0])
-    on_edge = floor > 0
+    # Floor and sky hide nothing.
+    nearness = jnp.where(floor_first | (sky > 0.5), 0.0, _BACK * slopes[0])
+    on_edge = floor > sky
+
+    down, up = jnp.where(floor_first, 0.5 * (1.0 - floor), -0.5 * floor), 0.5 * sky
+    shift = tuple(down * a + up * b for a, b in zip(floor_shift, top_shift, strict=True))
 
     def layer(cover: Array, s: Vector, row: Texture) -> Layer:
-        return Layer(nearness, cover, s, (-eye[0], -eye[1]), row)
+        return Layer(nearness, cover, shift, s, (-eye[0], -eye[1]), row)
 
     zero = jnp.zeros_like(part)
     as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / jnp.maximum(eye[2], NEAR)), floor_row)
@@ -190,9 +240,9 @@ def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
     return _Room(
         first=choose(floor_first, as_floor, as_wall),
         second=choose(floor_first, as_wall, choose(on_edge, as_floor, as_other)),
-        behind_none=arena.sky,
-        behind_one=jnp.where(floor_first, wall_row.brightness, beside),
-        behind_two=mean,
+        behind_one=arena.sky,
+        behind_two=jnp.where(floor_first, wall_row.brightness, beside),
+        behind_three=mean,
     )
 
 
@@ -226,7 +276,12 @@ def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int
     centre_x, centre_y = layer.centre
     f = layer.texture.frequency
     point = (d[0] * t - centre_x) * f, (d[1] * t - centre_y) * f * handedness, (d[2] * t + eye[2]) * f
-    return texture.grey(layer.texture, point, step(pixels.d_u), step(pixels.d_v), bands)
+    across, down = step(pixels.d_u), step(pixels.d_v)
+    u, v = layer.shift
+    x, y, z = (p + u * a + v * b for p, a, b in zip(point, across, down, strict=True))
+    width, height = 1.0 - 2.0 * jnp.abs(u), 1.0 - 2.0 * jnp.abs(v)
+    across, down = tuple(width * a for a in across), tuple(height * b for b in down)
+    return texture.grey(layer.texture, (x, y, z), across, down, bands)
 
 
 def _once(quotient: Array) -> Array:

@@ -69,6 +69,8 @@ class Silhouette(NamedTuple):
     """1 for a cylinder, 0 for a box."""
     centre: Pair
     radius_square: Array
+    limb: Array
+    """r |o|: times 2 w, what q^2 is a pixel inside the limb (`layers`)."""
     polar: Pair
     """o/c of a cylinder."""
     texture: texture.Texture
@@ -151,6 +153,7 @@ def _of_boxes(boxes: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
         round=zero,
         centre=_xy(o),
         radius_square=zero,
+        limb=zero,
         polar=(zero, zero),
     )
 
@@ -180,6 +183,7 @@ def _of_cylinders(cylinders: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
         round=zero + 1.0,
         centre=_xy(o),
         radius_square=radius**2,
+        limb=radius * distance,
         polar=_xy(o / power[:, None]),
     )
 
