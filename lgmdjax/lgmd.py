@@ -157,10 +157,8 @@ def mean_excitation(
 ) -> Float[Array, ""]:
     """Average what passes T_s over the cells (eqs. 12, 13, and the division of eq. 14) [grey]."""
     S, margin = summation, summation - threshold
-    if params.smooth:
-        passed = S * jax.nn.sigmoid(margin / params.threshold_width)
-    else:
-        passed = jnp.where(margin >= 0, S, 0.0)
+    soft = params.smooth
+    passed = S * jax.nn.sigmoid(margin / params.threshold_width) if soft else jnp.where(margin >= 0, S, 0.0)
     return _mean(jnp.abs(passed))
 
 
