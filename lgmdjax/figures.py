@@ -325,6 +325,8 @@ def stretch(
 ) -> Figure:
     """Draw a stretch of recorded walking (fig. 12): u, distances, the rule's command and the learner's.
 
+    u, which every step shakes, is drawn with its mean over a second.
+
     Args:
         time: seconds. u: LGMD outputs. distances: nearest obstacle a side [m].
         label, predicted: velocities in multiples of 0.05 m/s.
@@ -338,16 +340,26 @@ def stretch(
         ("command of the learned controller", "v [0.05 m/s]"),
     )
     for axes, series, (title, unit) in zip(panels, (u, distances, label, predicted), titles, strict=True):
-        axes.plot(time, series[:, 0], color=LEFT, linewidth=1.0, label="left")
-        axes.plot(time, series[:, 1], color=RIGHT, linewidth=1.0, label="right")
+        for values, colour, side in zip(series.T, (LEFT, RIGHT), ("left", "right"), strict=True):
+            flickers = series is u
+            axes.plot(time, values, color=colour, linewidth=1.0, alpha=0.35 if flickers else 1.0, label=side)
+            if flickers:
+                axes.plot(time, _averaged(time, values), color=colour, linewidth=1.3)
         axes.set(title=title, ylabel=unit)
         axes.margins(x=0)
     panels[3].sharey(panels[2])
     panels[3].autoscale_view()
     panels[3].set_xlabel("time [s]")
-    panels[0].legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0)
+    panels[1].legend(ncols=2, loc="lower right", bbox_to_anchor=(1.0, 0.98), borderaxespad=0)
     figure.align_ylabels(panels)
     return figure
+
+
+def _averaged(time: Float[ndarray, " frames"], values: Float[ndarray, " frames"]) -> Float[ndarray, " frames"]:
+    """Average over a second; at the ends over what there is of it."""
+    rate = (len(time) - 1) / (time[-1] - time[0]) if len(time) > 1 else 1.0
+    window = np.ones(min(max(round(rate), 1), len(time)))
+    return np.convolve(values, window, mode="same") / np.convolve(np.ones_like(values), window, mode="same")
 
 
 @styled
@@ -435,7 +447,7 @@ def drivers(places: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Figure:
         for row, (name, score) in enumerate(scores.items()):
             rate, colour = score["per_100_m"], DRIVERS.get(name, QUIET)
             axes.plot([rate["low"], rate["high"]], [row, row], color=colour, linewidth=2.2)
-            axes.plot([rate["value"]], [row], "o", color=colour, markersize=6)
+            axes.plot([rate["value"]], [row], "o", color=colour, markersize=6, clip_on=False, zorder=3)
             axes.annotate(
                 f"{rate['value']:.3g}",
                 (rate["high"], row),

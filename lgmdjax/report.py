@@ -43,10 +43,10 @@ LOOKS_AT = {
     "random": "nothing",
 }
 LEARNERS = {
-    "lstm": "LSTM, the paper's",
-    "lstm-efference": "LSTM that also knows its last command",
-    "feed-forward": "feed-forward, no memory",
-    "mean": "the mean command, always",
+    "lstm": "LSTM (the paper's)",
+    "lstm-efference": "LSTM, last command too",
+    "feed-forward": "feed-forward",
+    "mean": "mean command",
 }
 Numbers = Mapping[str, np.ndarray]
 

@@ -189,3 +189,12 @@ def test_intervals_reach_from_low_to_high(run: Path, drawn: dict[str, Figure]):
     assert [label.get_text() for label in axes.get_yticklabels()] == list(scores)
     for bar, score in zip(bars, scores.values(), strict=True):
         np.testing.assert_allclose(bar.get_xdata(), (score["per_100_m"]["low"], score["per_100_m"]["high"]))
+
+
+def test_the_mean_over_a_second_lies_on_what_does_not_flicker(run: Path):
+    series = dict(np.load(run / "train/prediction.npz"))
+    series["u"] = np.stack([0.6 + 0.1 * np.sin(2 * np.pi * series["time"]), np.full(len(series["time"]), 0.7)], -1)
+    axes = panel(figures.stretch(**series), "LGMD outputs: all that the learner is given")
+    left, right = (line for line in axes.lines if line.get_alpha() is None)
+    np.testing.assert_allclose(np.asarray(left.get_ydata())[30:-30], 0.6, atol=1e-6)
+    np.testing.assert_allclose(right.get_ydata(), 0.7)
