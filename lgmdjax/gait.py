@@ -45,6 +45,8 @@ SKIM = 0.006  # m; lower than about this a swinging foot counts as if it stood, 
 STRIDE = 10.0  # what a millimetre of half a stride counts, divided by v: speed follows from it
 SWAY = 0.2  # what a milliradian or a millimetre a radian of phase of the trunk's motion counts
 
+ADAM = optax.scale_by_adam()
+
 
 @struct.dataclass(kw_only=True)
 class Gait:
@@ -155,16 +157,15 @@ def teach(
     *,
     key: Array | None = None,
     steps: int = 6000,
-    candidates: int = 48,
+    candidates: int = 32,
     literal: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> shaping.Params:
     """Fit the six shaping networks to the gait, on the CPG's limit cycle, by gradient (Adam).
 
     Host side; half a minute on two cores. Three networks are fitted and mirrored, so that the mirrored robot
-    walks mirrored. Of `candidates` random starts for each leg, judged by where they put the foot, six stay on
-    after a tenth of the steps and one after a third; then the three legs go on together, and what they do to
-    the trunk counts too: its sway and its speed.
+    walks mirrored. For an eighth of the steps each leg has `candidates` random starts, judged by where they put
+    the foot; then the best three go on together, and what they do to the trunk counts too: its sway and speed.
 
     Args:
         geometry: of the robot's legs.
@@ -182,12 +183,10 @@ def teach(
         lesson.inputs, lesson.targets, keys
     )
     left = geometry.replace(mounts=geometry.mounts[:3], mount_yaws=geometry.mount_yaws[:3])
-    tenth, third = steps // 10, steps // 3
-    networks = _descend(_search_loss, networks, left, lesson, 0.01, range(tenth), progress)
-    networks = _best(6, networks, left, lesson)
-    networks = _descend(_search_loss, networks, left, lesson, 0.01, range(tenth, third), progress)
-    networks = jax.tree.map(lambda weights: weights[0], _best(1, networks, left, lesson))
-    networks = _descend(_polish_loss, networks, left, lesson, 0.005, range(third, steps), progress)
+    search = steps // 8
+    networks = _descend(_search_loss, networks, left, lesson, 0.01, range(search), progress)
+    networks = _best(networks, left, lesson)
+    networks = _descend(_polish_loss, networks, left, lesson, 0.005, range(search, steps), progress)
     return _both_sides(networks, lesson, literal)
 
 
@@ -282,11 +281,11 @@ def _search_loss(networks: _Networks, left: Geometry, lesson: _Lesson) -> Float[
     return jnp.sum(_feet_loss(_foot_errors(networks, left, lesson), lesson))
 
 
-def _best(count: int, networks: _Networks, left: Geometry, lesson: _Lesson) -> _Networks:
-    """Keep each leg's best candidates, best first."""
+def _best(networks: _Networks, left: Geometry, lesson: _Lesson) -> _Networks:
+    """Choose each leg's best candidate."""
     losses = _feet_loss(_foot_errors(networks, left, lesson), lesson)
-    order = jnp.argsort(jnp.where(jnp.isfinite(losses), losses, jnp.inf), axis=0)[:count]
-    return jax.tree.map(lambda weights: weights[order, jnp.arange(3)], networks)
+    best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf), axis=0)
+    return jax.tree.map(lambda weights: weights[best, jnp.arange(3)], networks)
 
 
 def _polish_loss(networks: _Networks, left: Geometry, lesson: _Lesson) -> Float[Array, ""]:
@@ -315,26 +314,31 @@ def _descend(
     progress: Callable[[int, float], None] | None,
 ) -> _Networks:
     """Follow the gradient with Adam, ever slower, and tell the progress every hundred steps."""
-    optimiser = optax.adam(optax.cosine_decay_schedule(rate, max(len(steps), 1)))
-    slope = jax.value_and_grad(partial(loss, left=left, lesson=lesson))
-
-    @jax.jit
-    def some(networks, state, count):
-        def once(_, carry):
-            networks, state, _ = carry
-            value, gradient = slope(networks)
-            updates, state = optimiser.update(gradient, state, networks)
-            return optax.apply_updates(networks, updates), state, value
-
-        return jax.lax.fori_loop(0, count, once, (networks, state, jnp.zeros(())))
-
-    state = optimiser.init(networks)
+    state = ADAM.init(networks)
     for done in range(0, len(steps), 100):
-        count = min(100, len(steps) - done)
-        networks, state, value = some(networks, state, count)
+        upto = min(done + 100, len(steps))
+        spans = [jnp.asarray(x, dtype=float) for x in (rate, done, upto, len(steps))]
+        networks, state, value = _descend_some(loss, networks, state, left, lesson, *spans)
         if progress:
-            progress(steps.start + done + count, float(value))
+            progress(steps.start + upto, float(value))
     return networks
+
+
+@partial(jax.jit, static_argnums=0)
+def _descend_some(loss, networks, state, left, lesson, rate, done, upto, length):
+    """Take steps `done` to `upto` of `length`; their numbers are no constants, so that one program serves all."""
+
+    def once(carry):
+        networks, state, _, step = carry
+        value, gradient = jax.value_and_grad(loss)(networks, left, lesson)
+        with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
+            updates, state = ADAM.update(gradient, state)
+        pace = -rate * 0.5 * (1 + jnp.cos(jnp.pi * step / length))
+        networks = jax.tree.map(lambda weight, update: weight + pace * update, networks, updates)
+        return networks, state, value, step + 1
+
+    carry = (networks, state, jnp.zeros_like(rate), done)
+    return jax.lax.while_loop(lambda carry: carry[3] < upto, once, carry)[:3]
 
 
 def _both_sides(networks: _Networks, lesson: _Lesson, literal: bool) -> shaping.Params:

@@ -62,9 +62,7 @@ def xml_path() -> Path:
     for place in places:
         if (place / "hexapod.xml").is_file():
             return place / "hexapod.xml"
-    raise InputError(
-        f"expected hexapod.xml in {' or '.join(map(str, places))}, found none: reinstall lgmdjax"
-    )
+    raise InputError(f"expected hexapod.xml in {' or '.join(map(str, places))}, found none: reinstall lgmdjax")
 
 
 def load(path: Path | str | None = None) -> mujoco.MjModel:
@@ -76,9 +74,7 @@ def load(path: Path | str | None = None) -> mujoco.MjModel:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(
-            f"expected a MuJoCo model in {path}, it does not compile ({reason}): mend it"
-        ) from None
+        raise InputError(f"expected a MuJoCo model in {path}, it does not compile ({reason}): mend it") from None
     servos = [model.actuator(i).name for i in range(model.nu)]
     expected = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
     if servos != expected:
@@ -136,9 +132,7 @@ def _free(tree: Any) -> Any:
 
     Tied ones would not be sharded with others, and `jit` compiles anew for each mixture of tied and free arguments.
     """
-    return jax.tree.map(
-        lambda leaf: leaf if isinstance(leaf, jax.core.Tracer) else jnp.array(np.asarray(leaf)), tree
-    )
+    return jax.tree.map(lambda leaf: leaf if isinstance(leaf, jax.core.Tracer) else jnp.array(np.asarray(leaf)), tree)
 
 
 def stance() -> Float[np.ndarray, "6 3"]:

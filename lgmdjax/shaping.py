@@ -26,7 +26,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save as serialise
 
 from lgmdjax.errors import InputError
 
@@ -90,13 +90,12 @@ def save(path: Path | str, params: Params, metadata: Mapping[str, object] | None
     header = {"format": FORMAT, "version": VERSION, "literal": json.dumps(params.literal)}
     header |= {name: json.dumps(value) for name, value in (metadata or {}).items()}
     partial = path.with_name(path.name + ".part")
+    weights = {name: np.asarray(getattr(params, name), np.float32) for name in SHAPES}
     try:
-        save_file({name: np.asarray(getattr(params, name), np.float32) for name in SHAPES}, partial, header)
+        partial.write_bytes(serialise(weights, header))
         partial.replace(path)
     except OSError as error:
-        raise InputError(
-            f"{path}: expected a place to write to, got {error.strerror}; choose another"
-        ) from error
+        raise InputError(f"{path}: expected a place to write to, got {error.strerror}; choose another") from error
 
 
 def load(path: Path | str) -> Params:
@@ -120,7 +119,7 @@ def load(path: Path | str) -> Params:
     if not all(np.isfinite(weight).all() for weight in weights.values()):
         raise InputError(f"{path}: expected finite weights, got some that are not; {again}")
     arrays = {name: jnp.asarray(weight, dtype=float) for name, weight in weights.items()}
-    return Params(**arrays, literal=json.loads(header["literal"]))
+    return Params(**arrays, literal=header.get("literal") == "true")
 
 
 def metadata(path: Path | str) -> dict[str, object]:

@@ -11,7 +11,8 @@ from reference import cpg as reference
 from lgmdjax import cpg
 from lgmdjax.errors import InputError
 
-RATE = 180  # steps a second, and a cycle at the default cycle time
+RATE = 180  # steps a second, and a cycle
+PARAMS = cpg.Params(cycle_time=1.0)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -33,7 +34,7 @@ def flat(state):
 @pytest.fixture(scope="module")
 def from_random_starts():
     keys = jax.random.split(jax.random.key(0), 64)
-    return np.asarray(jax.vmap(lambda key: outputs(cpg.Params(), cpg.init(cpg.Params(), key), 22 * RATE))(keys))
+    return np.asarray(jax.vmap(lambda key: outputs(PARAMS, cpg.init(PARAMS, key), 22 * RATE))(keys))
 
 
 def test_every_random_start_becomes_a_tripod(from_random_starts):
@@ -50,20 +51,20 @@ def test_every_random_start_becomes_a_tripod(from_random_starts):
 
 
 def test_random_starts_swing_as_far_as_the_settled_one(from_random_starts):
-    settled = outputs(cpg.Params(), cpg.settled(cpg.Params()), RATE)
+    settled = outputs(PARAMS, cpg.settled(PARAMS), RATE)
     amplitudes = np.abs(from_random_starts[:, -RATE:]).max(1)
     np.testing.assert_allclose(amplitudes, np.abs(settled).max(), rtol=1e-3)
     assert np.abs(settled).max() == pytest.approx(0.567, abs=1e-3)
 
 
 def test_the_default_start_has_no_transient():
-    x = np.asarray(outputs(cpg.Params(), cpg.init(cpg.Params()), 5 * RATE))
+    x = np.asarray(outputs(PARAMS, cpg.init(PARAMS), 5 * RATE))
     np.testing.assert_allclose(x[:RATE], x[-RATE:], atol=3e-5)
     np.testing.assert_allclose(cpg.phases(x, 1 / RATE, 1.0), [0, 0.5, 0, 0.5, 0, 0.5], atol=1e-6)
 
 
 def test_period_and_waveform_equal_scipy():
-    params = cpg.Params()
+    params = PARAMS
     ours = np.asarray(outputs(params, cpg.settled(params), 10 * RATE))
     natural = reference.period(flat(cpg.settled(params)))
     assert natural == pytest.approx(cpg.NATURAL_PERIOD, rel=1e-6)
@@ -74,7 +75,7 @@ def test_period_and_waveform_equal_scipy():
 
 
 def test_transient_equals_scipy():
-    params = cpg.Params()
+    params = PARAMS
     start = cpg.init(params, jax.random.key(3))
     ours = np.asarray(outputs(params, start, 2 * RATE))
     theirs = reference.solve(flat(start), np.arange(1, 2 * RATE + 1) / RATE * cpg.NATURAL_PERIOD)
@@ -92,7 +93,7 @@ def convergence(start, duration, steps):
 def test_fourth_order_where_no_neuron_crosses_zero():
     """One stretch of the limit cycle, 0.06 to 0.44 of it, in which every activation keeps its sign."""
     P = cpg.NATURAL_PERIOD
-    point = reference.solve(flat(cpg.settled(cpg.Params())), np.array([0.06 * P]))[-1]
+    point = reference.solve(flat(cpg.settled(PARAMS)), np.array([0.06 * P]))[-1]
     u, v = jnp.asarray(point[:2].T), jnp.asarray(point[2:].T)
     slope, _ = convergence(cpg.State(activation=u, adaptation=v), 0.38 * P, [16, 32, 64, 128])
     assert slope == pytest.approx(4.0, abs=0.2)
@@ -100,13 +101,13 @@ def test_fourth_order_where_no_neuron_crosses_zero():
 
 def test_second_order_over_cycles_because_the_rectifier_bends():
     steps = [100, 141, 200, 283, 400, 566, 800, 1131, 1600]
-    slope, errors = convergence(cpg.settled(cpg.Params()), cpg.NATURAL_PERIOD, steps)
+    slope, errors = convergence(cpg.settled(PARAMS), cpg.NATURAL_PERIOD, steps)
     assert 1.6 < slope < 2.9  # uneven: what counts is where in a step the crossings fall
     assert errors[-1] < 2e-6
 
 
 def test_printed_sign_does_not_oscillate():
-    params = cpg.Params(printed_sign=True)
+    params = PARAMS.replace(printed_sign=True)
     for seed in range(4):
         start = cpg.init(params, jax.random.key(seed))
         assert np.abs(outputs(params, start, 20 * RATE)[-RATE:]).max() < 1e-6
@@ -114,7 +115,7 @@ def test_printed_sign_does_not_oscillate():
 
 def test_printed_weights_never_make_a_tripod():
     """The legs of one tripod settle a third of a cycle apart, and the two tripods are told apart no more."""
-    params = cpg.Params(coupling=cpg.coupling(within_tripod=0.40, across=0.04))
+    params = PARAMS.replace(coupling=cpg.coupling(within_tripod=0.40, across=0.04))
     np.testing.assert_allclose(params.coupling, reference.W_PRINTED)
     keys = jax.random.split(jax.random.key(1), 12)
     x = np.asarray(jax.vmap(lambda key: outputs(params, cpg.init(params, key), 60 * RATE))(keys))
@@ -127,19 +128,19 @@ def test_printed_weights_never_make_a_tripod():
 
 
 def test_amplitude_follows_the_drive_and_the_period_does_not():
-    x = outputs(cpg.Params(), cpg.settled(cpg.Params()), 2 * RATE)
-    doubled = cpg.Params(tonic=2.0)
+    x = outputs(PARAMS, cpg.settled(PARAMS), 2 * RATE)
+    doubled = PARAMS.replace(tonic=2.0)
     np.testing.assert_allclose(outputs(doubled, cpg.settled(doubled), 2 * RATE), 2 * x, atol=1e-12)
 
 
 def test_cycle_time_is_in_seconds():
-    params = cpg.Params(cycle_time=0.6)
-    x = np.asarray(outputs(params, cpg.settled(params), 10 * RATE))
-    assert cpg.period(x[:, 0], 1 / RATE) == pytest.approx(0.6, rel=2e-5)
+    for params, cycle in ((cpg.Params(), cpg.CYCLE_TIME), (cpg.Params(cycle_time=0.6), 0.6)):
+        x = np.asarray(outputs(params, cpg.settled(params), 10 * RATE))
+        assert cpg.period(x[:, 0], 1 / RATE) == pytest.approx(cycle, rel=2e-5)
 
 
 def test_mirrored_legs_run_mirrored_half_a_cycle_later():
-    x = np.asarray(outputs(cpg.Params(), cpg.settled(cpg.Params()), RATE))
+    x = np.asarray(outputs(PARAMS, cpg.settled(PARAMS), RATE))
     np.testing.assert_allclose(x[:-90, ::-1], x[90:], atol=1e-5)
 
 
@@ -152,9 +153,9 @@ def test_runs_in_either_precision(precision, strict):
 
 def test_gradient_reaches_every_constant():
     def swing(params):
-        return jnp.sum(outputs(params, cpg.settled(cpg.Params()), 90)[-1] ** 2)
+        return jnp.sum(outputs(params, cpg.settled(PARAMS), 90)[-1] ** 2)
 
-    for name, slope in vars(jax.grad(swing)(cpg.Params())).items():
+    for name, slope in vars(jax.grad(swing)(PARAMS)).items():
         if name not in ("printed_sign", "substeps"):
             assert np.all(np.isfinite(slope)) and np.any(np.asarray(slope) != 0), name
 
