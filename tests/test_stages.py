@@ -92,7 +92,8 @@ def test_every_driver_is_scored_on_the_same_seeds_in_both_places(run):
 
 
 def test_run_again_does_nothing_again(out, run):
-    before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.is_file() and path.name != "lock"}
+    files = [path for path in run.rglob("*") if path.is_file() and path.name != ".lock"]
+    before = {path: path.stat().st_mtime_ns for path in files}
     again = command("reproduce", "--scale", "smoke", "--out", str(out), "--seed", "3", "--name", "smoke")
     assert again.returncode == 0
     assert again.stdout.count("up to date") == 5
