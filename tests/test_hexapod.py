@@ -15,10 +15,9 @@ from lgmdjax.errors import InputError
 
 STEPS = 18  # 0.1 s, a call of `run`
 LANES = 6
-FIELDS = ["qpos", "qvel", "qacc", "qacc_warmstart", "time", "ctrl", "actuator_force", "qfrc_actuator", "qfrc_bias"]
-FIELDS += ["qfrc_passive", "qfrc_constraint", "xpos", "xquat", "xmat", "xipos", "geom_xpos", "geom_xmat", "site_xpos"]
-FIELDS += ["site_xmat", "subtree_com", "cvel"]
-ACCELERATIONS = {"qacc", "qacc_warmstart", "qfrc_constraint"}
+MOTION = ["time", "ctrl", "qpos", "qvel", "xpos", "xquat", "xmat", "xipos", "geom_xpos", "geom_xmat", "site_xpos"]
+MOTION += ["site_xmat", "subtree_com", "cvel"]
+FORCES = ["qacc", "qacc_warmstart", "actuator_force", "qfrc_actuator", "qfrc_bias", "qfrc_passive", "qfrc_constraint"]
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +165,8 @@ def test_mjx_equals_c_after_a_kick(body, model, run):
     course = jnp.broadcast_to(jnp.asarray(hexapod.stance()), (LANES, STEPS, 6, 3))
     scenes = touching(body)
     # Tighter than a walk needs: accelerations are compared as well.
-    after, _ = run(model.replace(opt=model.opt.replace(tolerance=jnp.asarray(1e-10))), stacked(scenes), data, course)
+    tight = model.replace(opt=model.opt.replace(tolerance=jnp.full_like(model.opt.tolerance, 1e-10)))
+    after, _ = run(tight, stacked(scenes), data, course)
     for lane, scene in enumerate(scenes):
         placed = hexapod.place_obstacles(model, scene, hexapod.pose(jax.tree.map(lambda x: x[0], data)))
         twin = reference.twin(hexapod.load(), placed)
@@ -178,12 +178,11 @@ def test_mjx_equals_c_after_a_kick(body, model, run):
             mujoco.mj_step(twin, there)
             touches += np.sum((there.contact.dim == 1) & (there.contact.dist < 0))
         assert (touches > 0) == (lane > 0)  # each leans on what was put there
-        # A stiff contact turns a difference of 1e-6 m into one of 1e-3 m/s^2: accelerations on the open floor only.
-        for field in (field for field in FIELDS if lane == 0 or field not in ACCELERATIONS):
+        for field in MOTION + FORCES:
             here = np.asarray(getattr(after, field)[lane]).reshape(np.shape(getattr(there, field)))
-            np.testing.assert_allclose(
-                here, getattr(there, field), atol=1e-4, rtol=1e-4, err_msg=f"{field}, lane {lane}"
-            )
+            # The two find a capsule's points on a box's edge by different means: the forces of the moment differ a bit.
+            within = 1e-4 if lane == 0 or field in MOTION else 2e-2
+            np.testing.assert_allclose(here, getattr(there, field), atol=within, err_msg=f"{field}, lane {lane}")
 
 
 HOMES = reference.MOUNTS + 0.1 * np.stack([np.cos(reference.MOUNT_YAWS), np.sin(reference.MOUNT_YAWS)], axis=-1)
@@ -318,16 +317,23 @@ def test_reverse_mode_passes_the_differentiable_solver_and_no_other(model):
         jax.eval_shape(gradient, model, stance)
 
 
+def kinds(tree) -> list:
+    """List shape and type of every leaf; the trees themselves hold arrays that have no truth value when compared."""
+    return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
+
+
 def test_a_step_keeps_types_and_shapes_in_either_precision(precision, strict):
+    def kinds(tree):
+        return jax.tree.structure(tree), [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
+
     model = hexapod.build()
     data = hexapod.reset(model, jnp.zeros(3))
     assert data.qpos.dtype == precision
-    assert jax.eval_shape(hexapod.reset, model, jnp.zeros(3)) == jax.eval_shape(lambda: data)
+    assert kinds(jax.eval_shape(hexapod.reset, model, jnp.zeros(3))) == kinds(data)
     after = jax.eval_shape(hexapod.substep, model, data, jnp.asarray(hexapod.stance(), dtype=float))
-    assert after == jax.eval_shape(lambda: data)
+    assert kinds(after) == kinds(data)
     scene = room(boxes=boxes(((1.0, 0.5), (0.3, 0.2), 0.4)))
-    placed = jax.eval_shape(hexapod.place_obstacles, model, scene, hexapod.pose(data))
-    assert placed == jax.eval_shape(lambda: model)
+    assert kinds(jax.eval_shape(hexapod.place_obstacles, model, scene, hexapod.pose(data))) == kinds(model)
 
 
 def test_nothing_is_tied_to_a_device(model):
