@@ -30,6 +30,8 @@ _FAR = 1.0e3
 """What is farther away [m] is shaded as if it were here."""
 
 
+_OPEN = 1.0e4
+"""A margin [px], or an inverse depth [1/m], that stands for no limit at all."""
 _BACK = 0.97
 """Walls count as farther away, so that what touches them is not cut by them within a pixel of its outline."""
 
@@ -127,17 +129,21 @@ def _prism(prism: Silhouette, pixels: Rays) -> Layer:
     by_side = 0.5 * (right - left)
     near, far = _sides(prism, pixels, by_side)
     side = _slopes(near, pixels)
-    last = _slopes(choose(prism.lid != 0, far, near), pixels)
+    # From within its wedge a prism can be entered by its lid only, and only the lid ends.
+    within, lidless = prism.open > 0.75, prism.lid == 0
+    last = _slopes(choose(lidless, near, far), pixels)
+    upward = jnp.where(prism.lid > 0, -1.0, 1.0).astype(prism.lid.dtype)
     lid_rise, lid_shift = _rise(prism.lid_end, last, pixels)
     other_rise, other_shift = _rise(prism.other_end, side, pixels)
-    to_lid = _clip(prism.upward * lid_rise + prism.lid_open)
-    to_other = _clip(prism.other_open - prism.upward * other_rise)
-    by_lid_end, by_other_end = 0.5 * prism.upward * (1.0 - to_lid), 0.5 * prism.upward * (to_other - 1.0)
-    shift_u = by_lid_end * lid_shift[0] + by_other_end * other_shift[0] + by_side * pixels.rightward[0]
-    shift_v = by_lid_end * lid_shift[1] + by_other_end * other_shift[1] + by_side * pixels.rightward[1]
+    to_lid = _clip(upward * lid_rise + jnp.where(within & lidless, _OPEN, 0.5))
+    to_other = _clip(jnp.where(within, _OPEN, 0.5) - upward * other_rise)
+    by_lid_end, by_other_end = 0.5 * upward * (1.0 - to_lid), 0.5 * upward * (to_other - 1.0)
+    shift_u, shift_v = (
+        by_lid_end * lid_shift[i] + by_other_end * other_shift[i] + by_side * pixels.rightward[i] for i in (0, 1)
+    )
     cover = jnp.maximum(left + right - 1.0, 0.0) * jnp.maximum(to_lid + to_other - 1.0, 0.0)
     on_lid = prism.lid * d[2]
-    by_lid = on_lid < side[0] + prism.lid_bias
+    by_lid = on_lid < side[0] + jnp.where(lidless, -_OPEN, jnp.where(within, _OPEN, 0.0))
     s = (jnp.where(by_lid, 0.0, near[0]), jnp.where(by_lid, 0.0, near[1]), jnp.where(by_lid, prism.lid, 0.0))
     nearness = jnp.where(cover > 0, jnp.where(by_lid, on_lid, side[0]), -1.0)
     return Layer(nearness, cover, (shift_u, shift_v), s, prism.centre, prism.texture)
@@ -149,14 +155,25 @@ def _sides(prism: Silhouette, pixels: Rays, shift: Array) -> tuple[Pair, Pair]:
     The rays are those through the middle of what is covered of a pixel, `shift` to the right of its own.
     """
     x, y = pixels.d[0] + shift * pixels.turn[0], pixels.d[1] + shift * pixels.turn[1]
-    near_x, near_y, (c, s) = prism.near_x, prism.near_y, prism.axis
-    near = choose((near_x[0] - near_y[0]) * x + (near_x[1] - near_y[1]) * y < 0, near_x, near_y)
+    c, s = prism.axis
     along, aside = c * x + s * y, c * y - s * x
-    far_x, far_y = jnp.where(along > 0, *prism.far_x), jnp.where(aside > 0, *prism.far_y)
+    near_x, far_x, between_x = _faces(prism.ahead[0], prism.behind[0], along)
+    near_y, far_y, between_y = _faces(prism.ahead[1], prism.behind[1], aside)
+    # A box is entered by the last of its near faces and left by the first of its far ones.
+    none = jnp.where(between_x, _OPEN, 0.0) - jnp.where(between_y, _OPEN, 0.0)
+    near = choose(near_x * along + none < near_y * aside, (near_x * c, near_x * s), (-near_y * s, near_y * c))
     far = choose(far_x * along > far_y * aside, (far_x * c, far_x * s), (-far_y * s, far_y * c))
     near_round, far_round = _round_sides(prism, x, y, pixels.width)
-    is_round = prism.round > 0
+    is_round = prism.radius_square > 0
     return choose(is_round, near_round, near), choose(is_round, far_round, far)
+
+
+def _faces(ahead: Array, behind: Array, along: Array) -> tuple[Array, Array, Array]:
+    """1/distance, along an axis, of a box's near and far face, and whether the eye is between: then both are far."""
+    beyond_ahead, between = ahead < 0, (ahead > 0) & (behind < 0)
+    far = jnp.where(beyond_ahead, behind, ahead)
+    far_behind = jnp.where(between, behind, far)
+    return jnp.where(beyond_ahead, ahead, behind), jnp.where(along > 0, far, far_behind), between
 
 
 def _round_sides(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[Pair, Pair]:
@@ -165,7 +182,8 @@ def _round_sides(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[P
     q^2 = (d.o)^2 - c d^2, taken as r^2 d^2 - (o x d)^2, which keeps its digits, and not let below what it is a tenth
     of a pixel inside the limb, where the side turns away without end.
     """
-    (o_x, o_y), (p_x, p_y) = prism.centre, prism.polar
+    (o_x, o_y), power = prism.centre, prism.power
+    p_x, p_y = o_x * power, o_y * power
     moment = o_x * y - o_y * x
     q_square = prism.radius_square * (x * x + y * y) - moment * moment
     inverse = lax.rsqrt(jnp.maximum(q_square, 0.2 * prism.limb * width + 1e-12))

@@ -30,14 +30,16 @@ from lgmdjax.prisms import Prisms, is_parked, turned
 
 NEAR = 1.0e-4
 """Nothing is nearer to an eye than this [m]; what is, counts as this."""
-_OPEN = 1.0e4
-"""A margin [px], or an inverse depth [1/m], that stands for no limit at all."""
 
 Pair = tuple[Array, Array]
 
 
 class Silhouette(NamedTuple):
-    """One prism, or an array of them, as an eye sees it; plane vectors in world axes. All zero: nothing."""
+    """One prism, or an array of them, as an eye sees it; plane vectors in world axes. All zero: nothing.
+
+    No more numbers than it takes, and the rest from these in `layers`: every tile's loop reads them from memory once
+    for each of its prisms, and from about 250 such numbers on LLVM no longer vectorises it (ten times slower).
+    """
 
     left: Pair
     """n_l; zero where the eye is above or below the prism, within its wedge."""
@@ -47,32 +49,22 @@ class Silhouette(NamedTuple):
     lid_end: Array
     """z of the end with the lid; of the top if no lid is seen."""
     other_end: Array
-    upward: Array
-    """1 if the lid's end is the top, else -1."""
-    lid_open: Array
-    """Margin [px] added to the one of the lid's end: half a pixel, or _OPEN where it is no limit."""
-    other_open: Array
     lid: Array
-    """1/z of the lid; 0 where none is seen."""
-    lid_bias: Array
-    """Inverse depth by which the lid lies further ahead than it does: _OPEN if there is no other way in, minus that
-    if there is no lid."""
+    """1/z of the lid, negative for a top; 0 where none is seen."""
     axis: Pair
     """A box's x axis."""
-    near_x: Pair
-    """s of a box's near face across its x axis; that of the other pair of faces where the eye is between."""
-    near_y: Pair
-    far_x: Pair
-    """1/distance of the faces across a box's x axis by which rays leave, in its direction and against it."""
-    far_y: Pair
-    round: Array
-    """1 for a cylinder, 0 for a box."""
+    ahead: Pair
+    """1/distance along the box's axes of the faces that rays along the axes meet; negative: the eye is beyond."""
+    behind: Pair
+    """The same of the opposite faces; positive: the eye is beyond."""
     centre: Pair
+    """o."""
     radius_square: Array
+    """r^2 of a cylinder, 0 for a box."""
     limb: Array
     """r |o|: times 2 w, what q^2 is a pixel inside the limb (`layers`)."""
-    polar: Pair
-    """o/c of a cylinder."""
+    power: Array
+    """1/c."""
     texture: texture.Texture
 
 
@@ -122,8 +114,7 @@ def pick(silhouettes: Silhouette, shows: Array, slots: int) -> list[Silhouette]:
     chosen = jnp.where((number[:, None] == numbers) & shows[:, None], 1.0, 0.0).astype(table.dtype)
     picked = jnp.einsum("tkn,nf->tkf", chosen, table, precision=lax.Precision.HIGHEST)
     return [
-        jax.tree.unflatten(structure, [picked[:, k, i] for i in range(len(leaves))])
-        for k in range(numbers.shape[0])
+        jax.tree.unflatten(structure, [picked[:, k, i] for i in range(len(leaves))]) for k in range(numbers.shape[0])
     ]
 
 
@@ -131,9 +122,6 @@ def _of_boxes(boxes: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
     o = boxes.centre - eye[:2]
     x_axis, y_axis = (turned(jnp.asarray(e, dtype=o.dtype), boxes.yaw) for e in ([1.0, 0.0], [0.0, 1.0]))
     local = -turned(o, -boxes.yaw)
-    near, ahead, behind, between = _pair_of_faces(boxes.half_size - local, boxes.half_size + local)
-    near_x, near_y = near[:, :1] * x_axis, near[:, 1:] * y_axis
-    near_x, near_y = jnp.where(between[:, :1], near_y, near_x), jnp.where(between[:, 1:], near_x, near_y)
     signs = jnp.asarray([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]], dtype=o.dtype)
     offsets = boxes.half_size[:, None, :] * signs
     corners = o[:, None, :] + offsets[..., :1] * x_axis[:, None] + offsets[..., 1:] * y_axis[:, None]
@@ -142,19 +130,15 @@ def _of_boxes(boxes: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
     return _silhouette(
         boxes,
         eye,
-        jnp.all(between, axis=-1),
+        jnp.all(jnp.abs(local) < boxes.half_size, axis=-1),
         _outermost(o, corners),
         (_norm(gap), jnp.max(_norm(corners), axis=-1)),
         axis=_xy(x_axis),
-        near_x=_xy(near_x),
-        near_y=_xy(near_y),
-        far_x=(ahead[:, 0], behind[:, 0]),
-        far_y=(ahead[:, 1], behind[:, 1]),
-        round=zero,
-        centre=_xy(o),
+        ahead=_xy(1.0 / _away_from_zero(boxes.half_size - local)),
+        behind=_xy(-1.0 / _away_from_zero(boxes.half_size + local)),
         radius_square=zero,
         limb=zero,
-        polar=(zero, zero),
+        power=zero,
     )
 
 
@@ -162,7 +146,6 @@ def _of_cylinders(cylinders: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
     o, radius = cylinders.centre - eye[:2], cylinders.half_size[:, 0]
     distance = jnp.maximum(_norm(o), NEAR)
     within = distance < radius
-    power = _away_from_zero((distance - radius) * (distance + radius))
     sine = jnp.where(within, 0.5, radius / jnp.where(within, 1.0, distance))
     cosine = jnp.sqrt(jnp.maximum(1.0 - sine * sine, 1e-8))
     along = o / distance[:, None]
@@ -176,15 +159,11 @@ def _of_cylinders(cylinders: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
         (along - aside, along + aside),
         (jnp.maximum(distance - radius, 0.0), distance + radius),
         axis=(zero, zero),
-        near_x=(zero, zero),
-        near_y=(zero, zero),
-        far_x=(zero, zero),
-        far_y=(zero, zero),
-        round=zero + 1.0,
-        centre=_xy(o),
+        ahead=(zero, zero),
+        behind=(zero, zero),
         radius_square=radius**2,
         limb=radius * distance,
-        polar=_xy(o / power[:, None]),
+        power=1.0 / _away_from_zero((distance - radius) * (distance + radius)),
     )
 
 
@@ -195,7 +174,6 @@ def _silhouette(
     # Nothing is seen under the floor, where padding is parked.
     z_t, z_b = prisms.top - eye[2], jnp.maximum(prisms.bottom, 0.0) - eye[2]
     from_above, from_below = z_t < 0, z_b > 0
-    lidded = from_above | from_below
     lid_end, other_end = jnp.where(from_below, z_b, z_t), jnp.where(from_below, z_t, z_b)
     sides = jnp.where(within, 0.0, 1.0)[:, None]
     silhouette = Silhouette(
@@ -204,11 +182,8 @@ def _silhouette(
         open=jnp.where(is_parked(prisms), 0.0, jnp.where(within, 1.0, 0.5)),
         lid_end=lid_end,
         other_end=other_end,
-        upward=jnp.where(from_below, -1.0, 1.0).astype(lid_end.dtype),
-        lid_open=jnp.where(within & ~lidded, _OPEN, 0.5),
-        other_open=jnp.where(within, _OPEN, 0.5),
-        lid=jnp.where(lidded, 1.0 / _away_from_zero(lid_end), 0.0),
-        lid_bias=jnp.where(lidded, jnp.where(within, _OPEN, 0.0), -_OPEN),
+        lid=jnp.where(from_above | from_below, 1.0 / _away_from_zero(lid_end), 0.0),
+        centre=_xy(prisms.centre - eye[:2]),
         texture=texture.prepare(prisms.texture),
         **shape,
     )
@@ -216,16 +191,6 @@ def _silhouette(
     highest = jnp.arctan2(z_t, jnp.where(from_above, farthest, nearest))
     lowest = jnp.arctan2(z_b, jnp.where(from_below, farthest, nearest))
     return silhouette, lax.stop_gradient(Bounds(nearest, lowest, highest, within))
-
-
-def _pair_of_faces(ahead: Array, behind: Array) -> tuple[Array, Array, Array, Array]:
-    """1/distance of a pair of faces, along an axis: the near one's, and the far one's for rays along the axis and
-    against it, which are two only if the eye is between."""
-    plus, minus = 1.0 / _away_from_zero(ahead), -1.0 / _away_from_zero(behind)
-    between = (ahead > 0) & (behind > 0)
-    beyond = ahead <= 0
-    far = jnp.where(beyond, minus, plus)
-    return jnp.where(beyond, plus, minus), far, jnp.where(between, minus, far), between
 
 
 def _outermost(o: Array, corners: Float[Array, "n 4 2"]) -> Pair:
