@@ -322,15 +322,7 @@ def kinds(tree) -> list:
     return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
 
 
-def kinds(tree) -> list:
-    """List shape and type of every leaf; the trees themselves hold arrays that have no truth value when compared."""
-    return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
-
-
 def test_a_step_keeps_types_and_shapes_in_either_precision(precision, strict):
-    def kinds(tree):
-        return jax.tree.structure(tree), [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
-
     model = hexapod.build()
     data = hexapod.reset(model, jnp.zeros(3))
     assert data.qpos.dtype == precision
