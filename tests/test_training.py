@@ -88,9 +88,7 @@ def test_an_epoch_equals_rmsprop_by_hand():
     for first in (0, 4, 8):
         (value, state), gradient = slope(weights, state, tuple(range(first, first + 4)))
         mean_square = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g**2, mean_square, gradient)
-        weights = jax.tree.map(
-            lambda w, g, m: w - 1e-3 * g / jnp.sqrt(m + 1e-7), weights, gradient, mean_square
-        )
+        weights = jax.tree.map(lambda w, g, m: w - 1e-3 * g / jnp.sqrt(m + 1e-7), weights, gradient, mean_square)
         errors.append(value)
     np.testing.assert_allclose(fitted.train, [np.mean(errors)], rtol=1e-9)
     for got, expected in zip(jax.tree.leaves(fitted.params.weights), jax.tree.leaves(weights), strict=True):
@@ -114,6 +112,26 @@ def test_memory_pays_and_the_table_says_so(data):
         assert min(rows["lstm"][f"{name}_r2"]) > 0.6 and rows["lstm"][f"{name}_steering"] > 0.8
         assert rows["lstm-efference"][f"{name}_mse"] < errors[1]
         assert rows["mean"][f"{name}_steering"] == 0 and max(rows["mean"][f"{name}_r2"]) < 0.01
+
+
+def test_a_timid_network_is_enlivened(data):
+    """Its turns then vary as the labels do, within bounds, and never less than before."""
+    params = training.standardise(navigator.create(jax.random.key(0)), data[0])
+
+    def turns(velocities):
+        velocities = np.concatenate(velocities)
+        return np.std(velocities[:, 1] - velocities[:, 0])
+
+    said, asked = turns(training.predict(params, data[2])), turns([w.label for w in data[2]])
+    gain = asked / said
+    assert gain > 1
+    livelier = training.enliven(params, data[2], most=2 * gain)
+    assert turns(training.predict(livelier, data[2])) == pytest.approx(asked, rel=1e-6)
+    np.testing.assert_array_equal(livelier.output_mean, params.output_mean)
+    bounded = training.enliven(params, data[2], most=0.5 + gain / 2)
+    np.testing.assert_allclose(bounded.output_scale, (0.5 + gain / 2) * params.output_scale)
+    loud = replace(params, output_scale=3 * gain * params.output_scale)
+    np.testing.assert_array_equal(training.enliven(loud, data[2]).output_scale, loud.output_scale)
 
 
 def test_predictions_are_the_steps(data):
