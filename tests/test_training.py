@@ -123,7 +123,7 @@ def test_a_timid_network_is_enlivened(data):
         return np.std(velocities[:, 1] - velocities[:, 0])
 
     said, asked = turns(training.predict(params, data[2])), turns([w.label for w in data[2]])
-    gain = asked / said
+    gain = float(asked / said)
     assert gain > 1
     livelier = training.enliven(params, data[2], most=2 * gain)
     assert turns(training.predict(livelier, data[2])) == pytest.approx(asked, rel=1e-6)
