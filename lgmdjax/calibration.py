@@ -25,7 +25,7 @@ from flax import struct
 from jaxtyping import Array, Float
 from scipy import ndimage
 
-from lgmdjax import arena, camera, hexapod, lgmd
+from lgmdjax import arena, camera, episodes, lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE, Record
 
@@ -50,26 +50,22 @@ def survey(
     params: lgmd.Params,
     eyes: camera.Params,
     arenas: arena.Arena,
-    positions: Float[Array, "robots frames 3"],
-    quaternions: Float[Array, "robots frames 4"],
+    record: Record,
     thresholds: Float[Array, "candidates"],
 ) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
     """Draw what recorded walks saw once more, and return U / n_cell for every threshold, and FF, of both eyes."""
 
-    def look(position: Array, quaternion: Array, room: arena.Arena) -> Array:
-        pose = hexapod.Pose(position=position, quaternion=quaternion)
-        return camera.render(eyes, room, *hexapod.eye_poses(pose))
-
-    def walk(room: arena.Arena, positions: Array, quaternions: Array):
-        def frame(state: lgmd.State, pose: tuple[Array, Array]):
+    def walk(room: arena.Arena, *poses: Array):
+        def frame(state: lgmd.State, pose: tuple[Array, Array, Array]):
             step = jax.vmap(lgmd.excitations, in_axes=(None, 0, 0, None))
-            state, response = step(params, state, look(*pose, room), thresholds)
+            state, response = step(params, state, episodes.picture(eyes, room, *pose), thresholds)
             return state, (response.excitation, response.feed_forward)
 
-        opened = jax.vmap(lgmd.init, in_axes=(None, 0))(params, look(positions[0], quaternions[0], room))
-        return jax.lax.scan(frame, opened, (positions, quaternions))[1]
+        first = episodes.picture(eyes, room, *(leaf[0] for leaf in poses))
+        opened = jax.vmap(lgmd.init, in_axes=(None, 0))(params, first)
+        return jax.lax.scan(frame, opened, poses)[1]
 
-    return jax.vmap(walk)(arenas, positions, quaternions)
+    return jax.vmap(walk)(arenas, record.time, record.position, record.quaternion)
 
 
 def choose(record: Record, excitation: np.ndarray, feed_forward: np.ndarray, thresholds: np.ndarray) -> Choice:

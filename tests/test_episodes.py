@@ -3,12 +3,27 @@
 import json
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lgmdjax import episodes
+from lgmdjax import (
+    braitenberg,
+    camera,
+    controller,
+    cpg,
+    drivers,
+    episodes,
+    hexapod,
+    laser,
+    lgmd,
+    rollout,
+    shaping,
+    simulation,
+)
 from lgmdjax.errors import InputError
 
 SHAPES = {
@@ -128,6 +143,40 @@ def test_stretches_are_sound_uninterrupted_and_touch_nothing(tmp_path):
 def test_a_missing_stretch_of_time_ends_a_stretch(tmp_path):
     write(tmp_path, record(), record(start=35))
     assert [len(s) for s in episodes.stretches(episodes.read(tmp_path), minimum=1)] == [18, 20] * 2
+
+
+EYES = camera.Params(width=48, height=36, overlap=0.6)
+
+
+def robot(velocity: tuple[float, float]) -> simulation.Params:
+    """A robot that walks a bend whatever it sees."""
+    nerves = controller.Params(
+        lgmd=lgmd.Params(),
+        driver=drivers.Blind(velocity=jnp.asarray(velocity)),
+        cpg=cpg.Params(),
+        shaping=shaping.taught(),
+    )
+    return simulation.Params(controller=nerves, teacher=braitenberg.Params(), camera=EYES, laser=laser.Params())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("float32")
+def test_pictures_are_drawn_again_from_the_poses(tmp_path):
+    """From Parquet, as the walking robots saw them; and the same bits each time, whatever part is drawn."""
+    params, model = robot((1.0, 0.6)), hexapod.build()
+    rooms = rollout.random_rooms(jax.random.key(1), 2, density=0.3)
+    states, seen = rollout.start(params, model, rooms, driver=drivers.BLIND), []
+    writer = episodes.Writer(tmp_path, SETTINGS)
+    for _ in range(30):
+        states, chunk = rollout.advance(params, model, rooms, states, driver=drivers.BLIND, frames=1, draw=True)
+        seen.append(np.array(states.controller.lgmd.frame))
+        writer.write(chunk, episode=0, rooms=[0, 1], seed=1)
+    for robot_seen, walk in zip(np.stack(seen, axis=1), episodes.read(tmp_path), strict=True):
+        room = jax.tree.map(lambda leaf, robot=walk.robot: leaf[robot], rooms.arena)
+        drawn = episodes.redraw(EYES, room, walk)
+        assert np.ptp(drawn, axis=0).max() > 20  # the world does move
+        np.testing.assert_allclose(drawn, robot_seen, rtol=0, atol=1e-3)
+        np.testing.assert_array_equal(drawn[7:11], episodes.redraw(EYES, room, walk[7:11]))
 
 
 def refused(folder, match, **arguments):

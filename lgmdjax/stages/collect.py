@@ -60,7 +60,7 @@ def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any
     thresholds = jnp.asarray(calibration.THRESHOLDS)
     print("calibrate: drawing the walks for all candidates of T_s", flush=True)
     excitation, feed_forward = calibration.survey(
-        lgmd.Params(), crew.eyes(settings.eyes), rooms.arena, record.position, record.quaternion, thresholds
+        lgmd.Params(), crew.eyes(settings.eyes), rooms.arena, record, thresholds
     )
     choice = calibration.choose(record, np.asarray(excitation), np.asarray(feed_forward), np.asarray(thresholds))
     detector = {"inhibition": lgmd.Params().inhibition, "overlap": settings.eyes.overlap}

@@ -115,15 +115,9 @@ def _layers(detector: lgmd.Params, eyes: scales.Eyes, walk: simulation.Record) -
     """Draw the frame of a walk that excited its left eye most, whole and at the paper's resolution, with its layers."""
     steady = np.where(np.asarray(walk.setbacks) == walk.setbacks[-1], walk.excitation[:, 0], 0.0)
     last = max(int(np.argmax(steady)), 2)
-    full = camera.Params()
-
-    @jax.jit
-    def draw(position, quaternion):
-        pose = hexapod.Pose(position=position, quaternion=quaternion)
-        return camera.render(full, scenes.testing_room(), *hexapod.eye_poses(pose))[0]
-
-    pictures = [draw(walk.position[k], walk.quaternion[k]) for k in range(last - 2, last + 1)]
+    shown = jax.tree.map(lambda leaf: leaf[last - 2 : last + 1], walk)
+    pictures = episodes.redraw(camera.Params(), scenes.testing_room(), shown)[:, lgmd.LEFT]
     state, _ = lgmd.step(detector, lgmd.init(detector, pictures[0]), pictures[1])
     cells = lgmd.layers(detector, state, pictures[2])
     named = {"E": cells.excitation, "I": cells.inhibition, "S": cells.summation}
-    return {"picture": np.asarray(pictures[2])} | {name: np.asarray(layer) for name, layer in named.items()}
+    return {"picture": pictures[2]} | {name: np.asarray(layer) for name, layer in named.items()}
