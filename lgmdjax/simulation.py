@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
-from lgmdjax import arena, braitenberg, camera, controller, hexapod, laser, lgmd
+from lgmdjax import arena, braitenberg, camera, controller, hexapod, laser
 from lgmdjax.drivers import Driver, Senses
 
 Leaf = Array | np.ndarray
@@ -102,7 +102,8 @@ def step(
 ) -> tuple[State, Record]:
     """Run one frame: set back if it touched, sense, decide, move.
 
-    Without `draw` the eyes stay shut (u = 0.5): for drivers that do not look, in walks whose pictures nobody wants.
+    Without `draw` the eyes stay shut and see black (u = 0.5): for drivers that do not look, in walks whose pictures
+    nobody wants.
     """
     state = set_back(params, room, state, driver)
     scene = arena.at(room.arena, state.frame / FRAME_RATE)
@@ -137,22 +138,19 @@ def sense(
     distances = laser.hemifields(laser.scan(params.laser, scene, *hexapod.laser_pose(pose)))
     nerves = state.controller
 
-    def look(eyes: lgmd.State) -> tuple[lgmd.State, lgmd.Response]:
-        frames = camera.render(params.camera, scene, *hexapod.eye_poses(pose))
-        opened = _where(state.fresh, controller.open_eyes(params.controller, frames), eyes)
-        seeing, response = controller.see(params.controller, replace(nerves, lgmd=opened), frames)
-        return seeing.lgmd, response
-
-    def look_away(eyes: lgmd.State) -> tuple[lgmd.State, lgmd.Response]:
-        still = jnp.zeros_like(distances)
-        return eyes, lgmd.Response(u=still + lgmd.STILL, feed_forward=still, excitation=still)
-
-    # One program for both, which takes half a minute to compile; the choice is the same for a whole crowd.
-    eyes, response = jax.lax.cond(draw, look, look_away, nerves.lgmd)
+    # One program for both, which takes half a minute to compile; the choice is the same for a whole crowd. Only the
+    # drawing is in it, since XLA would else draw anew inside each of the loops that read the picture.
+    frames = jax.lax.cond(
+        draw,
+        lambda: camera.render(params.camera, scene, *hexapod.eye_poses(pose)),
+        lambda: jnp.zeros(camera.shape(params.camera), nerves.lgmd.frame.dtype),
+    )
+    opened = _where(state.fresh, controller.open_eyes(params.controller, frames), nerves.lgmd)
+    nerves, response = controller.see(params.controller, replace(nerves, lgmd=opened), frames)
     senses = Senses(
         u=response.u, feed_forward=response.feed_forward, excitation=response.excitation, distances=distances
     )
-    return replace(state, controller=replace(nerves, lgmd=eyes)), senses
+    return replace(state, controller=nerves), senses
 
 
 def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tuple[State, Float[Array, "2"]]:
