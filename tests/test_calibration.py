@@ -1,0 +1,151 @@
+"""Thresholds chosen on walks whose best ones are known, and a survey that equals the detector run one by one."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lgmdjax import arena, calibration, camera, episodes, lgmd
+from lgmdjax.errors import InputError
+from lgmdjax.simulation import FRAME_RATE, Record
+
+THRESHOLDS = np.array([0.5, 2.0, 8.0])
+FASTEST = 5.0  # grey, FF of the invented straight walking
+
+
+def record(nearness: np.ndarray, turning: np.ndarray | bool = False, **fields: np.ndarray) -> Record:
+    """A walk by things as near as `nearness` (robots, frames, 2), steering hard to the left where it is `turning`."""
+    robots, frames, _ = nearness.shape
+    steering = np.broadcast_to(turning, (robots, frames))[..., None] * np.array([-0.8, 0.8])
+    defaults = {
+        "time": np.tile(np.arange(frames) / FRAME_RATE, (robots, 1)),
+        "position": np.zeros((robots, frames, 3)),
+        "quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (robots, frames, 1)),
+        "joints": np.zeros((robots, frames, 6, 3)),
+        "u": np.full((robots, frames, 2), 0.5),
+        "feed_forward": np.zeros((robots, frames, 2)),
+        "excitation": np.zeros((robots, frames, 2)),
+        "distances": 1 / nearness,
+        "label": 1.2 + steering,
+        "velocity": 1.2 + steering,
+        "clearance": np.ones((robots, frames)),
+        "contact": np.zeros((robots, frames), bool),
+        "fresh": np.zeros((robots, frames), bool),
+        "setbacks": np.zeros((robots, frames), int),
+        "ok": np.ones((robots, frames), bool),
+    }
+    return Record(**{**defaults, **fields})
+
+
+def passing(robots: int = 3, frames: int = 1800) -> np.ndarray:
+    """Nearness [1/m] of things that come and go on either side, slowly beside a gait cycle."""
+    time = np.arange(frames)[:, None] / FRAME_RATE
+    phases = np.random.default_rng(4).uniform(0, 2 * np.pi, (robots, 1, 2))
+    return 1.2 + np.sin(2 * np.pi * time / [13.0, 17.0] + phases)
+
+
+def survey_of(nearness: np.ndarray, good: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Excitation that follows nearness for one candidate alone, with the sway of the gait on it; others are noise."""
+    rng = np.random.default_rng(5)
+    robots, frames, _ = nearness.shape
+    sway = 1 + 0.8 * np.sin(2 * np.pi * 1.25 * np.arange(frames) / FRAME_RATE)[:, None]
+    excitation = rng.uniform(0.5, 1.5, (robots, frames, 2, len(THRESHOLDS)))
+    excitation[..., good] = nearness * sway
+    return excitation, rng.uniform(0, FASTEST, (robots, frames, 2))
+
+
+@pytest.mark.parametrize("good", range(len(THRESHOLDS)))
+def test_the_threshold_that_tells_which_side_is_nearer_is_chosen(good):
+    nearness = passing()
+    choice = calibration.choose(record(nearness), *survey_of(nearness, good), THRESHOLDS)
+    assert choice.threshold == THRESHOLDS[good]
+    assert [row["threshold"] for row in choice.table] == THRESHOLDS.tolist()
+    scores = [row["score"] for row in choice.table]
+    assert scores[good] > 0.9 and max(np.delete(scores, good)) < 0.3
+
+
+def test_an_eye_that_looks_the_wrong_way_is_not_chosen():
+    nearness = passing()
+    excitation, feed_forward = survey_of(nearness)
+    swapped = excitation.copy()
+    swapped[..., 1] = swapped[:, :, ::-1, 1]
+    choice = calibration.choose(record(nearness), swapped, feed_forward, THRESHOLDS)
+    assert choice.threshold != THRESHOLDS[1]
+    assert choice.table[1]["score"] < 0
+
+
+def test_suppression_is_above_nearly_all_of_straight_walking():
+    nearness = passing()
+    excitation, feed_forward = survey_of(nearness)
+    choice = calibration.choose(record(nearness), excitation, feed_forward, THRESHOLDS)
+    assert 0.98 < np.mean(feed_forward <= choice.suppression) < 1
+
+
+@pytest.mark.parametrize("left_out", ["turning", "contact", "fresh", "not ok"])
+def test_frames_that_are_no_straight_walking_are_left_out(left_out):
+    """Whatever the eyes say there, and near it: the choice is that of a walk that has no such frames."""
+    nearness = passing()
+    excitation, feed_forward = survey_of(nearness)
+    bad = np.zeros(nearness.shape[:2], bool)
+    bad[:, 600:900] = True
+    walk = {
+        "turning": record(nearness, turning=bad),
+        "contact": record(nearness, contact=bad),
+        "fresh": record(nearness, fresh=bad),
+        "not ok": record(nearness, ok=~bad),
+    }[left_out]
+    alone = calibration.choose(walk, excitation, feed_forward, THRESHOLDS)
+    flooded = np.where(bad[..., None, None], 1000.0 * nearness[..., ::-1, None], excitation)
+    choice = calibration.choose(walk, flooded, np.where(bad[..., None], 200.0, feed_forward), THRESHOLDS)
+    assert choice.threshold == alone.threshold
+    assert choice.suppression == alone.suppression < FASTEST
+    for row, expected in zip(choice.table, alone.table, strict=True):
+        assert row == pytest.approx(expected, abs=1e-6)
+
+
+def test_too_little_straight_walking_is_refused():
+    nearness = passing(robots=1, frames=240)
+    with pytest.raises(InputError, match=r"expected .* straight walking, got .* s; record longer walks"):
+        calibration.choose(record(nearness), *survey_of(nearness), THRESHOLDS)
+    long = passing()
+    with pytest.raises(InputError, match=r"got 0.0 s"):
+        calibration.choose(record(long, turning=True), *survey_of(long), THRESHOLDS)
+
+
+def test_a_silent_eye_scores_nothing():
+    """A threshold above all that is seen has no correlation; it must not be a NaN that wins."""
+    nearness = passing()
+    excitation, feed_forward = survey_of(nearness)
+    excitation[..., 2] = 0.0
+    choice = calibration.choose(record(nearness), excitation, feed_forward, THRESHOLDS)
+    assert choice.threshold == THRESHOLDS[1]
+    assert all(np.isfinite(list(row.values())).all() for row in choice.table)
+
+
+def test_survey_equals_the_detector_run_once_a_threshold():
+    """Two robots, each in its own room with its own way, one of them by a box that moves."""
+    eyes = camera.Params(width=32, height=24, overlap=0.6)
+    still = arena.place([[0.8, -0.3], [1.2, 0.6]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
+    moving = arena.place([[1.0, 0.4]], 0.2, 0.8, goal=[[1.0, -0.4]], arrives=1.0)
+    rooms = [arena.empty_room(boxes=boxes) for boxes in (still, moving)]
+    steps = 0.02 * np.arange(8)[:, None] * np.array([[1.0, 0.1, 0.0], [0.9, -0.2, 0.0]])[:, None]
+    walk = replace(record(passing(2, 8)), position=steps + np.array([0.0, 0.0, 0.11]))
+    params = lgmd.Params()
+    arenas = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
+    excitation, feed_forward = calibration.survey(params, eyes, arenas, walk, jnp.asarray(THRESHOLDS))
+    assert excitation.shape == (2, 8, 2, 3) and feed_forward.shape == (2, 8, 2)
+    see = jax.jit(lgmd.step)
+    for robot, room in enumerate(rooms):
+        pictures = episodes.redraw(eyes, room, jax.tree.map(lambda leaf, robot=robot: leaf[robot], walk))
+        for side in (lgmd.LEFT, lgmd.RIGHT):
+            for k, threshold in enumerate(THRESHOLDS):
+                detector = replace(params, threshold=threshold)
+                state = lgmd.init(detector, pictures[0, side])
+                for frame, picture in enumerate(pictures[:, side]):
+                    state, response = see(detector, state, picture)
+                    here = robot, frame, side
+                    np.testing.assert_allclose(excitation[*here, k], response.excitation, atol=1e-9)
+                    np.testing.assert_allclose(feed_forward[here], response.feed_forward, atol=1e-9)
+    assert np.ptp(np.asarray(excitation)[:, 3:, :, 0]) > 0.01  # there is something to see
