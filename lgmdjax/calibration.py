@@ -20,6 +20,7 @@ Source: Cizek & Faigl, eqs. 12-16 and sec. 3.3; the statistic is our own.
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
@@ -55,7 +56,7 @@ def survey(
 ) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
     """Draw what recorded walks saw once more, and return U / n_cell for every threshold, and FF, of both eyes."""
 
-    def walk(room: arena.Arena, *poses: Array):
+    def walk(room: arena.Arena, poses: tuple[Array, Array, Array]):
         def frame(state: lgmd.State, pose: tuple[Array, Array, Array]):
             step = jax.vmap(lgmd.excitations, in_axes=(None, 0, 0, None))
             state, response = step(params, state, episodes.picture(eyes, room, *pose), thresholds)
@@ -65,7 +66,8 @@ def survey(
         opened = jax.vmap(lgmd.init, in_axes=(None, 0))(params, first)
         return jax.lax.scan(frame, opened, poses)[1]
 
-    return jax.vmap(walk)(arenas, record.time, record.position, record.quaternion)
+    poses = (record.time, record.position, record.quaternion)
+    return jax.vmap(walk)(arenas, jax.tree.map(jnp.asarray, poses))
 
 
 def choose(record: Record, excitation: np.ndarray, feed_forward: np.ndarray, thresholds: np.ndarray) -> Choice:

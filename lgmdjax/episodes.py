@@ -38,7 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lgmdjax import arena, camera, hexapod
 from lgmdjax.errors import InputError
-from lgmdjax.simulation import Record
+from lgmdjax.simulation import Leaf, Record
 
 FORMAT, VERSION = "lgmdjax episodes", 1
 SIDES = ("left", "right")
@@ -191,21 +191,32 @@ def parameters(folder: Path | str) -> dict[str, Any]:
     return _header(files[0])["parameters"] if files else {}
 
 
-def redraw(
-    eyes: camera.Params, room: arena.Arena, walk: Walk | Record
-) -> Float[np.ndarray, "frames 2 height columns"]:
-    """Draw what both eyes saw on a walk, or on a part of it, once more: grey levels 0..255.
+def batched(walks: Sequence[Walk]) -> Record:
+    """Put walks of equal length together again as one record with axes (robot, frame)."""
+    return Record(**{name: np.stack([getattr(walk, name) for walk in walks]) for name in FIELDS})
 
-    One compiled program draws every picture, so that the same poses give the same bits on the same machine. In the
-    walk the drawing was part of a larger program, which the compiler rounds elsewhere: what the robot saw differs by
-    less than 0.001 grey levels in single precision.
+
+def redraw(
+    eyes: camera.Params, rooms: arena.Arena, record: Record
+) -> Float[np.ndarray, "robots frames 2 height columns"]:
+    """Draw what the eyes of a crowd saw once more, grey levels 0..255: bit for bit on the machine where it walked.
+
+    One program draws every frame, so that any part of a walk gives the same bits. They are those of the walk if the
+    whole crowd is drawn, since the compiler may round a crowd of another size otherwise, by less than 0.001 grey
+    levels in single precision.
 
     Args:
-        room: the obstacles of the walk's room; moving ones are put where they were.
-        walk: the axis of its arrays is the frame.
+        rooms: a room a robot; things that move are put where they were.
+        record: axes (robot, frame), as `batched` gives it.
     """
-    poses = zip(walk.time, walk.position, walk.quaternion, strict=True)
-    return np.stack([picture(eyes, room, *pose) for pose in poses])
+    poses = (np.asarray(leaf) for leaf in (record.time, record.position, record.quaternion))
+    frames = zip(*(leaf.swapaxes(0, 1) for leaf in poses), strict=True)
+    return np.stack([_pictures(eyes, rooms, *frame) for frame in frames], axis=1)
+
+
+@partial(jax.jit, static_argnames="eyes")
+def _pictures(eyes: camera.Params, rooms: arena.Arena, *poses: Leaf) -> Float[Array, "robots 2 height columns"]:
+    return jax.vmap(partial(picture, eyes))(rooms, *poses)
 
 
 @partial(jax.jit, static_argnames="eyes")

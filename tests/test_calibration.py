@@ -130,15 +130,14 @@ def test_survey_equals_the_detector_run_once_a_threshold():
     still = arena.place([[0.8, -0.3], [1.2, 0.6]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
     moving = arena.place([[1.0, 0.4]], 0.2, 0.8, goal=[[1.0, -0.4]], arrives=1.0)
     rooms = [arena.empty_room(boxes=boxes) for boxes in (still, moving)]
+    arenas = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
     steps = 0.02 * np.arange(8)[:, None] * np.array([[1.0, 0.1, 0.0], [0.9, -0.2, 0.0]])[:, None]
     walk = replace(record(passing(2, 8)), position=steps + np.array([0.0, 0.0, 0.11]))
     params = lgmd.Params()
-    arenas = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
     excitation, feed_forward = calibration.survey(params, eyes, arenas, walk, jnp.asarray(THRESHOLDS))
     assert excitation.shape == (2, 8, 2, 3) and feed_forward.shape == (2, 8, 2)
     see = jax.jit(lgmd.step)
-    for robot, room in enumerate(rooms):
-        pictures = episodes.redraw(eyes, room, jax.tree.map(lambda leaf, robot=robot: leaf[robot], walk))
+    for robot, pictures in enumerate(episodes.redraw(eyes, arenas, walk)):
         for side in (lgmd.LEFT, lgmd.RIGHT):
             for k, threshold in enumerate(THRESHOLDS):
                 detector = replace(params, threshold=threshold)

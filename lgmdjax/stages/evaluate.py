@@ -84,12 +84,7 @@ def _walk(
         seconds = settings.testing_seconds if folder.parent.name == "testing" else settings.seconds
         chunks = crew.walks(crew.seat(params, driver), model, rooms, seconds, label, draw=sees)
         writer.write(rollout.together(list(chunks)), episode=0, rooms=range(settings.robots), seed=seed)
-    return batched(episodes.read(folder))
-
-
-def batched(walks: list[episodes.Walk]) -> simulation.Record:
-    """Put walks of equal length, read from disk, together again as one record with axes (robot, frame)."""
-    return simulation.Record(**{name: np.stack([getattr(walk, name) for walk in walks]) for name in episodes.FIELDS})
+    return episodes.batched(episodes.read(folder))
 
 
 def _trajectories(walked: Mapping[str, Mapping[str, simulation.Record]]) -> dict[str, np.ndarray]:
@@ -115,9 +110,11 @@ def _layers(detector: lgmd.Params, eyes: scales.Eyes, walk: simulation.Record) -
     """Draw the frame of a walk that excited its left eye most, whole and at the paper's resolution, with its layers."""
     steady = np.where(np.asarray(walk.setbacks) == walk.setbacks[-1], walk.excitation[:, 0], 0.0)
     last = max(int(np.argmax(steady)), 2)
-    shown = jax.tree.map(lambda leaf: leaf[last - 2 : last + 1], walk)
-    pictures = episodes.redraw(camera.Params(), scenes.testing_room(), shown)[:, lgmd.LEFT]
+    pictures = [
+        episodes.picture(camera.Params(), scenes.testing_room(), walk.time[k], walk.position[k], walk.quaternion[k])[0]
+        for k in range(last - 2, last + 1)
+    ]
     state, _ = lgmd.step(detector, lgmd.init(detector, pictures[0]), pictures[1])
     cells = lgmd.layers(detector, state, pictures[2])
     named = {"E": cells.excitation, "I": cells.inhibition, "S": cells.summation}
-    return {"picture": pictures[2]} | {name: np.asarray(layer) for name, layer in named.items()}
+    return {"picture": np.asarray(pictures[2])} | {name: np.asarray(layer) for name, layer in named.items()}
