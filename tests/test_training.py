@@ -66,7 +66,10 @@ def same(a, b):
 
 
 def test_an_epoch_equals_rmsprop_by_hand():
-    """Two stretches in three windows of four frames: state carried, gradient not, anew at a stretch."""
+    """Two stretches in three windows of four frames: state carried, gradient not, anew at a stretch.
+
+    Gradients are cut to length 1, and the rate falls like a cosine.
+    """
     walks = [walk(1, 7), walk(2, 5)]
     chosen = settings(epochs=1, window=4, streams=1)
     params = navigator.create(jax.random.key(1))
@@ -87,8 +90,12 @@ def test_an_epoch_equals_rmsprop_by_hand():
     slope = jax.jit(jax.value_and_grad(error, has_aux=True), static_argnums=2)
     for first in (0, 4, 8):
         (value, state), gradient = slope(weights, state, tuple(range(first, first + 4)))
+        length = np.sqrt(sum(np.sum(np.square(g)) for g in jax.tree.leaves(gradient)))
+        gradient = jax.tree.map(lambda g, length=length: g / max(1.0, length), gradient)
+        rate = chosen.learning_rate * (1 + np.cos(np.pi * (first / 4) / 3)) / 2
         mean_square = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g**2, mean_square, gradient)
-        weights = jax.tree.map(lambda w, g, m: w - 1e-3 * g / jnp.sqrt(m + 1e-7), weights, gradient, mean_square)
+        step = jax.tree.map(lambda g, m, rate=rate: rate * g / jnp.sqrt(m + 1e-7), gradient, mean_square)
+        weights = jax.tree.map(jnp.subtract, weights, step)
         errors.append(value)
     np.testing.assert_allclose(fitted.train, [np.mean(errors)], rtol=1e-9)
     for got, expected in zip(jax.tree.leaves(fitted.params.weights), jax.tree.leaves(weights), strict=True):
@@ -148,9 +155,9 @@ def test_predictions_are_the_steps(data):
 def test_curves_are_errors_of_the_best_and_the_last(data):
     train, test, _ = data
     fit = training.fit(navigator.create(jax.random.key(0)), train, test, settings(), show=False)
-    assert fit.test.argmin() == EPOCHS - 1 and same(fit.best, fit.params)
     # In whole stretches the network starts anew less often than in streams: nearly the same error.
-    np.testing.assert_allclose(training.score(fit.params, test)["mse"], fit.test[-1], rtol=0.1)
+    for params, error in ((fit.params, fit.test[-1]), (fit.best, fit.test.min())):
+        np.testing.assert_allclose(training.score(params, test)["mse"], error, rtol=0.1)
 
 
 def test_the_best_is_kept_when_the_test_error_rises(data):
