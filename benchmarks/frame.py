@@ -8,6 +8,7 @@ beside it, in the same run, what one would write without this library: a loop ov
 """
 
 import argparse
+import math
 import os
 import platform
 import statistics
@@ -54,7 +55,8 @@ def measure(params: simulation.Params, robots: int) -> tuple[float, float]:
     states = rollout.start(params, model, rooms, driver=drivers.TEACHER)
     fixed = {"driver": drivers.TEACHER, "frames": FRAMES}
     compiled = rollout.advance.lower(params, model, rooms, states, draw=jnp.asarray(True), **fixed).compile()
-    memory = compiled.memory_analysis().temp_size_in_bytes / 1e6 / robots
+    analysis = compiled.memory_analysis()
+    memory = analysis.temp_size_in_bytes / 1e6 / robots if analysis else math.nan  # not every device tells
     seconds = []
     for _ in range(REPEATS + 1):  # the first is thrown away
         began = time.perf_counter()

@@ -17,6 +17,7 @@ gives no formula. The legs' kinematics are in `lgmdjax.legs` and can be had from
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -182,7 +183,7 @@ def teach(
     networks = jax.vmap(jax.vmap(_start, in_axes=(None, 2, 0)), in_axes=(None, None, 0))(
         lesson.inputs, lesson.targets, keys
     )
-    left = geometry.replace(mounts=geometry.mounts[:3], mount_yaws=geometry.mount_yaws[:3])
+    left = replace(geometry, mounts=geometry.mounts[:3], mount_yaws=geometry.mount_yaws[:3])
     search = steps // 8
     networks = _descend(_search_loss, networks, left, lesson, 0.01, range(search), progress)
     networks = _best(networks, left, lesson)
@@ -229,7 +230,7 @@ def _lesson(geometry: Geometry, gait: Gait, network: cpg.Params, literal: bool) 
     rise = np.asarray(foot_path(gait, jnp.asarray(phases, dtype=float), jnp.zeros(PHASES))[:, 2])
     along = (phases - duty / 2) * stance
     relative = importance / np.maximum(np.abs(velocities), 0.4)
-    arrays = _Lesson(
+    lesson = dict(
         inputs=inputs / scale,
         scale=scale,
         targets=angles[:, :, :3],
@@ -240,7 +241,7 @@ def _lesson(geometry: Geometry, gait: Gait, network: cpg.Params, literal: bool) 
         stride=np.outer(along / (along @ along) * duty / 2, relative) / np.sqrt(3 * len(velocities)),
         trunk=_trunk(gait),
     )
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype=float), arrays)
+    return _Lesson(**{name: jnp.asarray(values, dtype=float) for name, values in lesson.items()})
 
 
 def _trunk(gait: Gait) -> Float[np.ndarray, "6 9"]:

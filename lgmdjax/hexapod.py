@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
@@ -132,7 +133,7 @@ def _free(tree: Any) -> Any:
 
     Tied ones would not be sharded with others, and `jit` compiles anew for each mixture of tied and free arguments.
     """
-    return jax.tree.map(lambda leaf: leaf if isinstance(leaf, jax.core.Tracer) else jnp.array(np.asarray(leaf)), tree)
+    return jax.tree.map(lambda leaf: leaf if isinstance(leaf, Tracer) else jnp.array(np.asarray(leaf)), tree)
 
 
 def stance() -> Float[np.ndarray, "6 3"]:

@@ -1,5 +1,6 @@
 """The rhythm: tripods from anywhere, SciPy's numbers, the printed forms' failures."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -107,7 +108,7 @@ def test_second_order_over_cycles_because_the_rectifier_bends():
 
 
 def test_printed_sign_does_not_oscillate():
-    params = PARAMS.replace(printed_sign=True)
+    params = replace(PARAMS, printed_sign=True)
     for seed in range(4):
         start = cpg.init(params, jax.random.key(seed))
         assert np.abs(outputs(params, start, 20 * RATE)[-RATE:]).max() < 1e-6
@@ -115,7 +116,7 @@ def test_printed_sign_does_not_oscillate():
 
 def test_printed_weights_never_make_a_tripod():
     """The legs of one tripod settle a third of a cycle apart, and the two tripods are told apart no more."""
-    params = PARAMS.replace(coupling=cpg.coupling(within_tripod=0.40, across=0.04))
+    params = replace(PARAMS, coupling=cpg.coupling(within_tripod=0.40, across=0.04))
     np.testing.assert_allclose(params.coupling, reference.W_PRINTED)
     keys = jax.random.split(jax.random.key(1), 12)
     x = np.asarray(jax.vmap(lambda key: outputs(params, cpg.init(params, key), 60 * RATE))(keys))
@@ -129,7 +130,7 @@ def test_printed_weights_never_make_a_tripod():
 
 def test_amplitude_follows_the_drive_and_the_period_does_not():
     x = outputs(PARAMS, cpg.settled(PARAMS), 2 * RATE)
-    doubled = PARAMS.replace(tonic=2.0)
+    doubled = replace(PARAMS, tonic=2.0)
     np.testing.assert_allclose(outputs(doubled, cpg.settled(doubled), 2 * RATE), 2 * x, atol=1e-12)
 
 

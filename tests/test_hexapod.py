@@ -64,8 +64,8 @@ def cylinders(*rows) -> arena.Prisms:
     return arena.place(jnp.asarray(centre), jnp.asarray(radius)[:, None], 0.4, count=3)
 
 
-def room(**prisms) -> arena.Arena:
-    return arena.empty_room((12.0, 12.0), **({"boxes": arena.parked(3), "cylinders": arena.parked(3)} | prisms))
+def room(boxes: arena.Prisms | None = None, cylinders: arena.Prisms | None = None) -> arena.Arena:
+    return arena.empty_room((12.0, 12.0), boxes=boxes or arena.parked(3), cylinders=cylinders or arena.parked(3))
 
 
 def in_c(body: mujoco.MjModel) -> mujoco.MjData:
@@ -76,7 +76,8 @@ def in_c(body: mujoco.MjModel) -> mujoco.MjData:
 
 def test_lengths_masses_and_limits_are_the_data_sheets(body):
     geometry = legs.geometry(body)
-    np.testing.assert_allclose([geometry.coxa, geometry.femur, geometry.tibia], [0.052, 0.066, 0.133], atol=1e-9)
+    lengths = np.array([geometry.coxa, geometry.femur, geometry.tibia])
+    np.testing.assert_allclose(lengths, [0.052, 0.066, 0.133], atol=1e-9)
     np.testing.assert_allclose(geometry.mounts[:, :2], reference.MOUNTS, atol=1e-9)
     np.testing.assert_allclose(geometry.mount_yaws, reference.MOUNT_YAWS, atol=1e-9)
     masses = [1.522, *[0.0247, 0.0858, 0.1718] * 6]

@@ -1,6 +1,7 @@
 """The shaping networks: the map against loops in NumPy, the paper's input, files good and bad."""
 
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ def by_hand(params, rhythm, velocity):
 @pytest.fixture
 def params():
     drawn = shaping.init(jax.random.key(0))
-    return drawn.replace(b1=jax.random.normal(jax.random.key(1), (6, 6)), b2=jnp.ones((6, 3)))
+    return replace(drawn, b1=jax.random.normal(jax.random.key(1), (6, 6)), b2=jnp.ones((6, 3)))
 
 
 @pytest.fixture
