@@ -1,10 +1,13 @@
-"""Choose the LGMD's thresholds on recorded walks: T_s by what it tells of distance, T_f by what walking looks like.
+"""Choose the LGMD's thresholds on recorded walks: T_s by what u tells of distance, T_f by what walking looks like.
 
 T_s "has to be set experimentally" (paper sec. 3.3). Here the pictures of a recorded walk are drawn again, and the
-detector is run with many thresholds at once. The best one is that whose left-right difference of log U, averaged over
-about a gait cycle, follows the difference of nearness best while the robot walks straight: steering is a matter of
-which side is nearer, and a turn floods both eyes whatever the threshold. T_f then lies above the FF of nearly all
-straight walking, so that only fast camera motion is cut, and no eye is cut for being near something.
+detector is run with many thresholds at once. The best one is that whose left-right difference of u, averaged over
+about a gait cycle, follows the difference of nearness best: steering is a matter of which side is nearer.
+
+T_f then lies above all FF that walking and turning make: the gate is left to motion that is not the robot's own, such
+as being lifted. A lower one cuts turns, and of two flooded eyes the nearer first, so that the difference of the two
+tells the wrong side: while turning hard it follows nearness with r = 0.3 with the gate open, and -0.6 with T_f at the
+FF of straight walking.
 
 | symbol      | name                    | unit |
 | ----------- | ----------------------- | ---- |
@@ -24,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
-from scipy import ndimage
+from scipy import ndimage, special
 
 from lgmdjax import arena, camera, episodes, lgmd
 from lgmdjax.errors import InputError
@@ -32,9 +35,7 @@ from lgmdjax.simulation import FRAME_RATE, Record
 
 THRESHOLDS = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # candidates for T_s, grey
 AVERAGED = 0.8  # s, about a gait cycle
-STRAIGHT = 0.5  # |v_r - v_l| up to which a walk is straight, nominal
-FASTEST_WALKING = 0.995  # share of straight walking that T_f lets pass
-FLOOR = 1e-3  # grey, added to U before its logarithm
+MARGIN = 1.25  # T_f over the greatest FF of walking
 
 
 @struct.dataclass(kw_only=True)
@@ -79,44 +80,46 @@ def choose(record: Record, excitation: np.ndarray, feed_forward: np.ndarray, thr
         feed_forward: FF, (robots, frames, 2) [grey].
         thresholds: the candidates [grey].
 
-    Raises InputError when there is too little straight walking to tell.
+    Raises InputError when there is too little sound walking to tell.
     """
-    straight = _straight(record)
-    if straight.sum() < 10 * FRAME_RATE:
+    sound = _sound(record)
+    if sound.sum() < 10 * FRAME_RATE:
         raise InputError(
-            f"calibration: expected 10 s or more of straight walking, got {straight.sum() / FRAME_RATE:.1f} s; "
+            f"calibration: expected 10 s or more of walking, got {sound.sum() / FRAME_RATE:.1f} s; "
             "record longer walks, or more robots"
         )
     nearness = 1 / np.asarray(record.distances)
-    averaged = ndimage.uniform_filter1d(np.asarray(excitation), round(AVERAGED * FRAME_RATE), axis=1)
+    u = special.expit(np.asarray(excitation))
+    averaged = ndimage.uniform_filter1d(u, round(AVERAGED * FRAME_RATE), axis=1)
     table = [
-        {"threshold": float(threshold), **_agreement(np.log(averaged[..., k] + FLOOR)[straight], nearness[straight]),
-         "median_excitation": float(np.median(excitation[straight][..., k]))}
+        {
+            "threshold": float(threshold),
+            **_agreement(averaged[sound][..., k], nearness[sound]),
+            "median_u": float(np.median(u[sound][..., k])),
+        }
         for k, threshold in enumerate(thresholds)
-    ]  # fmt: skip
+    ]
     best = max(table, key=lambda row: row["score"])
-    suppression = float(np.quantile(np.asarray(feed_forward)[straight], FASTEST_WALKING))
+    suppression = MARGIN * float(np.max(np.asarray(feed_forward)[sound]))
     return Choice(threshold=best["threshold"], suppression=suppression, table=table)
 
 
-def _straight(record: Record) -> np.ndarray:
-    """Tell which frames are straight walking that has lasted long enough for the average to be of nothing else."""
-    velocity = np.asarray(record.velocity)
+def _sound(record: Record) -> np.ndarray:
+    """Tell which frames are walking that has lasted long enough for the average to be of nothing else."""
     sound = np.asarray(record.ok) & ~np.asarray(record.contact) & ~np.asarray(record.fresh)
-    steady = sound & (np.abs(velocity[..., 1] - velocity[..., 0]) < STRAIGHT)
     window = round(AVERAGED * FRAME_RATE)
     # The average is centred; two windows leave a margin for the pictures of the put-down on either side.
-    return ndimage.minimum_filter1d(steady.astype(np.uint8), 2 * window + 1, axis=1, mode="constant").astype(bool)
+    return ndimage.minimum_filter1d(sound.astype(np.uint8), 2 * window + 1, axis=1, mode="constant").astype(bool)
 
 
-def _agreement(level: Float[np.ndarray, "frames 2"], nearness: Float[np.ndarray, "frames 2"]) -> dict[str, float]:
-    """Correlate log U with 1/d on either side, and the differences of the sides, which is the score."""
+def _agreement(u: Float[np.ndarray, "frames 2"], nearness: Float[np.ndarray, "frames 2"]) -> dict[str, float]:
+    """Correlate u with 1/d on either side, and the differences of the sides, which is the score."""
 
     def correlation(a: np.ndarray, b: np.ndarray) -> float:
         return float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0 and np.ptp(b) > 0 else 0.0
 
     return {
-        "score": correlation(level[:, 0] - level[:, 1], nearness[:, 0] - nearness[:, 1]),
-        "left": correlation(level[:, 0], nearness[:, 0]),
-        "right": correlation(level[:, 1], nearness[:, 1]),
+        "score": correlation(u[:, 0] - u[:, 1], nearness[:, 0] - nearness[:, 1]),
+        "left": correlation(u[:, 0], nearness[:, 0]),
+        "right": correlation(u[:, 1], nearness[:, 1]),
     }

@@ -38,6 +38,10 @@ from lgmdjax.checkpoints import Checkpoints
 from lgmdjax.episodes import Walk
 from lgmdjax.errors import InputError
 
+CAUTION = 1.5
+"""By how much a driver should turn harder than its teacher. One network, 120 m in unseen rooms: 8.4 collisions per
+100 m at 1.0, 0.9 at 1.6, 2.6 at 2.5, and of the way that it made in the time at 1.0, 90 % and 63 % are left."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -185,16 +189,20 @@ def predict(params: navigator.Params, walks: Sequence[Walk]) -> list[Float[np.nd
     return [velocity[: len(walk)] for walk, velocity in zip(walks, velocities, strict=True)]
 
 
-def enliven(params: navigator.Params, walks: Sequence[Walk], most: float = 2.5) -> navigator.Params:
-    """Scale the outputs about their mean until the navigator's turns vary as much as the labels do.
+def enliven(
+    params: navigator.Params, walks: Sequence[Walk], caution: float = CAUTION, most: float = 2.5
+) -> navigator.Params:
+    """Scale the outputs about their mean until the navigator's turns vary `caution` times as much as the labels do.
 
     The least mean squared error is that of a timid driver: the less sure the network is, the nearer it stays to
-    the mean, and a robot that turns half as hard as it should, when it should, walks into what it has seen. The
-    scale is `output_scale`, times std(turn of the labels) / std(turn predicted), from 1 up to `most`.
+    the mean, and a robot that turns half as hard as it should, when it should, walks into what it has seen. Nor do
+    errors cost the same: a turn too many costs a little time, a turn too few a collision. The scale is
+    `output_scale`, times std(turn of the labels) / std(turn predicted) from 1 up to `most`, times `caution`.
     """
     predicted, label = np.concatenate(predict(params, walks)), np.concatenate([walk.label for walk in walks])
     asked, given = (float(np.std(v[:, 1] - v[:, 0])) for v in (label, predicted))
-    return replace(params, output_scale=params.output_scale * float(np.clip(asked / max(given, 1e-6), 1.0, most)))
+    factor = caution * float(np.clip(asked / max(given, 1e-6), 1.0, most))
+    return replace(params, output_scale=params.output_scale * factor)
 
 
 def score(params: navigator.Params, walks: Sequence[Walk]) -> dict[str, Any]:

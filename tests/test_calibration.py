@@ -12,7 +12,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE, Record
 
 THRESHOLDS = np.array([0.5, 2.0, 8.0])
-FASTEST = 5.0  # grey, FF of the invented straight walking
+FASTEST = 5.0  # grey, FF of the invented walking
 
 
 def record(nearness: np.ndarray, turning: np.ndarray | bool = False, **fields: np.ndarray) -> Record:
@@ -76,22 +76,24 @@ def test_an_eye_that_looks_the_wrong_way_is_not_chosen():
     assert choice.table[1]["score"] < 0
 
 
-def test_suppression_is_above_nearly_all_of_straight_walking():
+def test_the_gate_is_left_open_by_walking_and_turning():
     nearness = passing()
     excitation, feed_forward = survey_of(nearness)
-    choice = calibration.choose(record(nearness), excitation, feed_forward, THRESHOLDS)
-    assert 0.98 < np.mean(feed_forward <= choice.suppression) < 1
+    turning = np.zeros(nearness.shape[:2], bool)
+    turning[:, 600:900] = True
+    feed_forward[turning] *= 4
+    choice = calibration.choose(record(nearness, turning=turning), excitation, feed_forward, THRESHOLDS)
+    assert feed_forward.max() < choice.suppression < 2 * feed_forward.max()
 
 
-@pytest.mark.parametrize("left_out", ["turning", "contact", "fresh", "not ok"])
-def test_frames_that_are_no_straight_walking_are_left_out(left_out):
+@pytest.mark.parametrize("left_out", ["contact", "fresh", "not ok"])
+def test_frames_that_are_no_walking_are_left_out(left_out):
     """Whatever the eyes say there, and near it: the choice is that of a walk that has no such frames."""
     nearness = passing()
     excitation, feed_forward = survey_of(nearness)
     bad = np.zeros(nearness.shape[:2], bool)
     bad[:, 600:900] = True
     walk = {
-        "turning": record(nearness, turning=bad),
         "contact": record(nearness, contact=bad),
         "fresh": record(nearness, fresh=bad),
         "not ok": record(nearness, ok=~bad),
@@ -100,18 +102,18 @@ def test_frames_that_are_no_straight_walking_are_left_out(left_out):
     flooded = np.where(bad[..., None, None], 1000.0 * nearness[..., ::-1, None], excitation)
     choice = calibration.choose(walk, flooded, np.where(bad[..., None], 200.0, feed_forward), THRESHOLDS)
     assert choice.threshold == alone.threshold
-    assert choice.suppression == alone.suppression < FASTEST
+    assert choice.suppression == alone.suppression < 2 * FASTEST
     for row, expected in zip(choice.table, alone.table, strict=True):
         assert row == pytest.approx(expected, abs=1e-6)
 
 
-def test_too_little_straight_walking_is_refused():
+def test_too_little_walking_is_refused():
     nearness = passing(robots=1, frames=240)
-    with pytest.raises(InputError, match=r"expected .* straight walking, got .* s; record longer walks"):
+    with pytest.raises(InputError, match=r"expected .* walking, got .* s; record longer walks"):
         calibration.choose(record(nearness), *survey_of(nearness), THRESHOLDS)
     long = passing()
     with pytest.raises(InputError, match=r"got 0.0 s"):
-        calibration.choose(record(long, turning=True), *survey_of(long), THRESHOLDS)
+        calibration.choose(record(long, fresh=np.ones(long.shape[:2], bool)), *survey_of(long), THRESHOLDS)
 
 
 def test_a_silent_eye_scores_nothing():
@@ -137,7 +139,7 @@ def test_survey_equals_the_detector_run_once_a_threshold():
     excitation, feed_forward = calibration.survey(params, eyes, arenas, walk, jnp.asarray(THRESHOLDS))
     assert excitation.shape == (2, 8, 2, 3) and feed_forward.shape == (2, 8, 2)
     see = jax.jit(lgmd.step)
-    for robot, pictures in enumerate(episodes.redraw(eyes, arenas, walk)):
+    for robot, pictures in enumerate(jnp.asarray(episodes.redraw(eyes, arenas, walk))):
         for side in (lgmd.LEFT, lgmd.RIGHT):
             for k, threshold in enumerate(THRESHOLDS):
                 detector = replace(params, threshold=threshold)
