@@ -1,8 +1,9 @@
-"""Choose the LGMD's thresholds on recorded walks: T_s by what u tells of distance, T_f by what walking looks like.
+"""Choose the LGMD's constants on recorded walks: T_s, W_I by what u tells of distance, T_f by what walking looks like.
 
 T_s "has to be set experimentally" (paper sec. 3.3). Here the pictures of a recorded walk are drawn again, and the
-detector is run with many thresholds at once. The best one is that whose left-right difference of u, averaged over
-about a gait cycle, follows the difference of nearness best: steering is a matter of which side is nearer.
+detector is run with many thresholds and weights at once. The best one is that whose left-right difference of u,
+averaged over about a gait cycle, follows the difference of nearness best: steering is a matter of which side is
+nearer.
 
 T_f then lies above all FF that walking and turning make: the gate is left to motion that is not the robot's own, such
 as being lifted. A lower one cuts turns, and of two flooded eyes the nearer first, so that the difference of the two
@@ -12,6 +13,7 @@ FF of straight walking.
 | symbol      | name                    | unit |
 | ----------- | ----------------------- | ---- |
 | T_s         | threshold               | grey |
+| W_I         | inhibition              | 1    |
 | T_f         | suppression             | grey |
 | U / n_cell  | excitation              | grey |
 | FF          | feed_forward            | grey |
@@ -20,48 +22,71 @@ FF of straight walking.
 Source: Cizek & Faigl, eqs. 12-16 and sec. 3.3; the statistic is our own.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
-from scipy import ndimage, special
+from scipy import ndimage
 
 from lgmdjax import arena, camera, episodes, lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE, Record
 
 THRESHOLDS = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # candidates for T_s, grey
+INHIBITIONS = (0.2, 0.4, 0.6)  # candidates for W_I; the paper's is 0.4
 AVERAGED = 0.8  # s, about a gait cycle
 MARGIN = 1.25  # T_f over the greatest FF of walking
 
 
 @struct.dataclass(kw_only=True)
+class Candidates:
+    """Pairs of constants to try."""
+
+    threshold: Float[Array | np.ndarray, "candidates"]  # T_s, grey
+    inhibition: Float[Array | np.ndarray, "candidates"]  # W_I
+
+
+@struct.dataclass(kw_only=True)
 class Choice:
-    """The thresholds chosen, and how all candidates did."""
+    """The constants chosen, and how all candidates did."""
 
     threshold: float
+    inhibition: float
     suppression: float
     table: list[dict[str, float]]
 
 
+def grid(thresholds: Sequence[float] = THRESHOLDS, inhibitions: Sequence[float] = INHIBITIONS) -> Candidates:
+    """Pair each threshold with each weight."""
+    pairs = np.array(list(product(inhibitions, thresholds)), dtype=float)
+    return Candidates(threshold=pairs[:, 1], inhibition=pairs[:, 0])
+
+
 @partial(jax.jit, static_argnames="eyes")
 def survey(
-    params: lgmd.Params,
-    eyes: camera.Params,
-    arenas: arena.Arena,
-    record: Record,
-    thresholds: Float[Array, "candidates"],
+    params: lgmd.Params, eyes: camera.Params, arenas: arena.Arena, record: Record, candidates: Candidates
 ) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
-    """Draw what recorded walks saw once more, and return U / n_cell for every threshold, and FF, of both eyes."""
+    """Draw what recorded walks saw once more, and return u for every candidate, the gate open, and FF, of both eyes."""
+
+    def see(candidate: Candidates, state: lgmd.State, picture: Array) -> tuple[lgmd.State, Array, Array]:
+        chosen = {"threshold": candidate.threshold, "inhibition": candidate.inhibition, "suppression": jnp.inf}
+        state, response = lgmd.step(replace(params, **chosen), state, picture)
+        return state, response.u, response.feed_forward
+
+    # What no candidate changes, the next state and FF, is evaluated once.
+    see_all = jax.vmap(see, in_axes=(0, None, None), out_axes=(None, 0, None))
 
     def walk(room: arena.Arena, poses: tuple[Array, Array, Array]):
         def frame(state: lgmd.State, pose: tuple[Array, Array, Array]):
-            step = jax.vmap(lgmd.excitations, in_axes=(None, 0, 0, None))
-            state, response = step(params, state, episodes.picture(eyes, room, *pose), thresholds)
-            return state, (response.excitation, response.feed_forward)
+            pictures = episodes.picture(eyes, room, *pose)
+            state, u, FF = jax.vmap(see_all, in_axes=(None, 0, 0))(candidates, state, pictures)
+            return state, (u, FF)
 
         first = episodes.picture(eyes, room, *(leaf[0] for leaf in poses))
         opened = jax.vmap(lgmd.init, in_axes=(None, 0))(params, first)
@@ -71,14 +96,14 @@ def survey(
     return jax.vmap(walk)(arenas, jax.tree.map(jnp.asarray, poses))
 
 
-def choose(record: Record, excitation: np.ndarray, feed_forward: np.ndarray, thresholds: np.ndarray) -> Choice:
-    """Choose T_s and T_f from a survey of recorded walks.
+def choose(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: Candidates) -> Choice:
+    """Choose T_s, W_I and T_f from a survey of recorded walks.
 
     Args:
         record: the walks, axes (robot, frame).
-        excitation: U / n_cell, (robots, frames, 2, candidates) [grey].
+        u: of every candidate, (robots, frames, 2, candidates).
         feed_forward: FF, (robots, frames, 2) [grey].
-        thresholds: the candidates [grey].
+        candidates: what was tried.
 
     Raises InputError when there is too little sound walking to tell.
     """
@@ -89,19 +114,17 @@ def choose(record: Record, excitation: np.ndarray, feed_forward: np.ndarray, thr
             "record longer walks, or more robots"
         )
     nearness = 1 / np.asarray(record.distances)
-    u = special.expit(np.asarray(excitation))
-    averaged = ndimage.uniform_filter1d(u, round(AVERAGED * FRAME_RATE), axis=1)
+    averaged = ndimage.uniform_filter1d(np.asarray(u), round(AVERAGED * FRAME_RATE), axis=1)[sound]
+    pairs = zip(candidates.threshold.tolist(), candidates.inhibition.tolist(), strict=True)
     table = [
-        {
-            "threshold": float(threshold),
-            **_agreement(averaged[sound][..., k], nearness[sound]),
-            "median_u": float(np.median(u[sound][..., k])),
-        }
-        for k, threshold in enumerate(thresholds)
+        {"threshold": T_s, "inhibition": W_I, **_agreement(averaged[..., k], nearness[sound])}
+        for k, (T_s, W_I) in enumerate(pairs)
     ]
     best = max(table, key=lambda row: row["score"])
     suppression = MARGIN * float(np.max(np.asarray(feed_forward)[sound]))
-    return Choice(threshold=best["threshold"], suppression=suppression, table=table)
+    return Choice(
+        threshold=best["threshold"], inhibition=best["inhibition"], suppression=suppression, table=table
+    )
 
 
 def _sound(record: Record) -> np.ndarray:

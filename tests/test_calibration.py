@@ -11,7 +11,7 @@ from lgmdjax import arena, calibration, camera, episodes, lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE, Record
 
-THRESHOLDS = np.array([0.5, 2.0, 8.0])
+CANDIDATES = calibration.Candidates(threshold=np.array([0.5, 2.0, 8.0]), inhibition=np.array([0.4, 0.2, 0.4]))
 FASTEST = 5.0  # grey, FF of the invented walking
 
 
@@ -47,42 +47,42 @@ def passing(robots: int = 3, frames: int = 1800) -> np.ndarray:
 
 
 def survey_of(nearness: np.ndarray, good: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Excitation that follows nearness for one candidate alone, with the sway of the gait on it; others are noise."""
+    """u that follows nearness for one candidate alone, with the sway of the gait on it; others are noise."""
     rng = np.random.default_rng(5)
     robots, frames, _ = nearness.shape
     sway = 1 + 0.8 * np.sin(2 * np.pi * 1.25 * np.arange(frames) / FRAME_RATE)[:, None]
-    excitation = rng.uniform(0.5, 1.5, (robots, frames, 2, len(THRESHOLDS)))
-    excitation[..., good] = nearness * sway
-    return excitation, rng.uniform(0, FASTEST, (robots, frames, 2))
+    u = rng.uniform(0.5, 1.0, (robots, frames, 2, len(CANDIDATES.threshold)))
+    u[..., good] = 0.5 + 0.1 * nearness * sway
+    return u, rng.uniform(0, FASTEST, (robots, frames, 2))
 
 
-@pytest.mark.parametrize("good", range(len(THRESHOLDS)))
+@pytest.mark.parametrize("good", range(len(CANDIDATES.threshold)))
 def test_the_threshold_that_tells_which_side_is_nearer_is_chosen(good):
     nearness = passing()
-    choice = calibration.choose(record(nearness), *survey_of(nearness, good), THRESHOLDS)
-    assert choice.threshold == THRESHOLDS[good]
-    assert [row["threshold"] for row in choice.table] == THRESHOLDS.tolist()
+    choice = calibration.choose(record(nearness), *survey_of(nearness, good), CANDIDATES)
+    assert (choice.threshold, choice.inhibition) == (CANDIDATES.threshold[good], CANDIDATES.inhibition[good])
+    assert [row["threshold"] for row in choice.table] == CANDIDATES.threshold.tolist()
     scores = [row["score"] for row in choice.table]
     assert scores[good] > 0.9 and max(np.delete(scores, good)) < 0.3
 
 
 def test_an_eye_that_looks_the_wrong_way_is_not_chosen():
     nearness = passing()
-    excitation, feed_forward = survey_of(nearness)
-    swapped = excitation.copy()
+    u, feed_forward = survey_of(nearness)
+    swapped = u.copy()
     swapped[..., 1] = swapped[:, :, ::-1, 1]
-    choice = calibration.choose(record(nearness), swapped, feed_forward, THRESHOLDS)
-    assert choice.threshold != THRESHOLDS[1]
+    choice = calibration.choose(record(nearness), swapped, feed_forward, CANDIDATES)
+    assert choice.threshold != CANDIDATES.threshold[1]
     assert choice.table[1]["score"] < 0
 
 
 def test_the_gate_is_left_open_by_walking_and_turning():
     nearness = passing()
-    excitation, feed_forward = survey_of(nearness)
+    u, feed_forward = survey_of(nearness)
     turning = np.zeros(nearness.shape[:2], bool)
     turning[:, 600:900] = True
     feed_forward[turning] *= 4
-    choice = calibration.choose(record(nearness, turning=turning), excitation, feed_forward, THRESHOLDS)
+    choice = calibration.choose(record(nearness, turning=turning), u, feed_forward, CANDIDATES)
     assert feed_forward.max() < choice.suppression < 2 * feed_forward.max()
 
 
@@ -90,7 +90,7 @@ def test_the_gate_is_left_open_by_walking_and_turning():
 def test_frames_that_are_no_walking_are_left_out(left_out):
     """Whatever the eyes say there, and near it: the choice is that of a walk that has no such frames."""
     nearness = passing()
-    excitation, feed_forward = survey_of(nearness)
+    u, feed_forward = survey_of(nearness)
     bad = np.zeros(nearness.shape[:2], bool)
     bad[:, 600:900] = True
     walk = {
@@ -98,9 +98,9 @@ def test_frames_that_are_no_walking_are_left_out(left_out):
         "fresh": record(nearness, fresh=bad),
         "not ok": record(nearness, ok=~bad),
     }[left_out]
-    alone = calibration.choose(walk, excitation, feed_forward, THRESHOLDS)
-    flooded = np.where(bad[..., None, None], 1000.0 * nearness[..., ::-1, None], excitation)
-    choice = calibration.choose(walk, flooded, np.where(bad[..., None], 200.0, feed_forward), THRESHOLDS)
+    alone = calibration.choose(walk, u, feed_forward, CANDIDATES)
+    flooded = np.where(bad[..., None, None], 10.0 * nearness[..., ::-1, None], u)
+    choice = calibration.choose(walk, flooded, np.where(bad[..., None], 200.0, feed_forward), CANDIDATES)
     assert choice.threshold == alone.threshold
     assert choice.suppression == alone.suppression < 2 * FASTEST
     for row, expected in zip(choice.table, alone.table, strict=True):
@@ -110,23 +110,29 @@ def test_frames_that_are_no_walking_are_left_out(left_out):
 def test_too_little_walking_is_refused():
     nearness = passing(robots=1, frames=240)
     with pytest.raises(InputError, match=r"expected .* walking, got .* s; record longer walks"):
-        calibration.choose(record(nearness), *survey_of(nearness), THRESHOLDS)
+        calibration.choose(record(nearness), *survey_of(nearness), CANDIDATES)
     long = passing()
     with pytest.raises(InputError, match=r"got 0.0 s"):
-        calibration.choose(record(long, fresh=np.ones(long.shape[:2], bool)), *survey_of(long), THRESHOLDS)
+        calibration.choose(record(long, fresh=np.ones(long.shape[:2], bool)), *survey_of(long), CANDIDATES)
 
 
 def test_a_silent_eye_scores_nothing():
     """A threshold above all that is seen has no correlation; it must not be a NaN that wins."""
     nearness = passing()
-    excitation, feed_forward = survey_of(nearness)
-    excitation[..., 2] = 0.0
-    choice = calibration.choose(record(nearness), excitation, feed_forward, THRESHOLDS)
-    assert choice.threshold == THRESHOLDS[1]
+    u, feed_forward = survey_of(nearness)
+    u[..., 2] = 0.5
+    choice = calibration.choose(record(nearness), u, feed_forward, CANDIDATES)
+    assert choice.threshold == CANDIDATES.threshold[1]
     assert all(np.isfinite(list(row.values())).all() for row in choice.table)
 
 
-def test_survey_equals_the_detector_run_once_a_threshold():
+def test_every_threshold_is_tried_with_every_weight():
+    grid = calibration.grid([1.0, 2.0, 3.0], [0.2, 0.4])
+    pairs = set(zip(grid.threshold.tolist(), grid.inhibition.tolist(), strict=True))
+    assert pairs == {(t, w) for t in (1.0, 2.0, 3.0) for w in (0.2, 0.4)}
+
+
+def test_survey_equals_the_detector_run_once_a_candidate():
     """Two robots, each in its own room with its own way, one of them by a box that moves."""
     eyes = camera.Params(width=32, height=24, overlap=0.6)
     still = arena.place([[0.8, -0.3], [1.2, 0.6]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
@@ -136,17 +142,17 @@ def test_survey_equals_the_detector_run_once_a_threshold():
     steps = 0.02 * np.arange(8)[:, None] * np.array([[1.0, 0.1, 0.0], [0.9, -0.2, 0.0]])[:, None]
     walk = replace(record(passing(2, 8)), position=steps + np.array([0.0, 0.0, 0.11]))
     params = lgmd.Params()
-    excitation, feed_forward = calibration.survey(params, eyes, arenas, walk, jnp.asarray(THRESHOLDS))
-    assert excitation.shape == (2, 8, 2, 3) and feed_forward.shape == (2, 8, 2)
+    u, feed_forward = calibration.survey(params, eyes, arenas, walk, CANDIDATES)
+    assert u.shape == (2, 8, 2, 3) and feed_forward.shape == (2, 8, 2)
     see = jax.jit(lgmd.step)
-    for robot, pictures in enumerate(jnp.asarray(episodes.redraw(eyes, arenas, walk))):
+    for robot, pictures in enumerate(episodes.redraw(eyes, arenas, walk)):
         for side in (lgmd.LEFT, lgmd.RIGHT):
-            for k, threshold in enumerate(THRESHOLDS):
-                detector = replace(params, threshold=threshold)
+            for k, pair in enumerate(zip(CANDIDATES.threshold, CANDIDATES.inhibition, strict=True)):
+                detector = replace(params, threshold=pair[0], inhibition=pair[1], suppression=1e9)
                 state = lgmd.init(detector, pictures[0, side])
                 for frame, picture in enumerate(pictures[:, side]):
                     state, response = see(detector, state, picture)
                     here = robot, frame, side
-                    np.testing.assert_allclose(excitation[*here, k], response.excitation, atol=1e-9)
+                    np.testing.assert_allclose(u[*here, k], response.u, atol=1e-9)
                     np.testing.assert_allclose(feed_forward[here], response.feed_forward, atol=1e-9)
-    assert np.ptp(np.asarray(excitation)[:, 3:, :, 0]) > 0.01  # there is something to see
+    assert np.ptp(np.asarray(u)[:, 3:, :, 0]) > 0.001  # there is something to see

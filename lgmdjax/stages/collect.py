@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lgmdjax import calibration, drivers, episodes, hexapod, lgmd, rollout, scales
 from lgmdjax.runs import write_json
 from lgmdjax.stages import crew
 
+CHOSEN = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
 CALIBRATION = 2**20  # an episode number beyond any other: its rooms are met nowhere else
 
 
@@ -46,7 +46,7 @@ def rooms_of(seed: int, episode: int, robots: int):
 def load_detector(folder: Path) -> lgmd.Params:
     """Read the detector that `collect` calibrated."""
     chosen = json.loads((folder / "calibration.json").read_text())
-    return lgmd.Params(threshold=chosen["threshold"], suppression=chosen["suppression"])
+    return lgmd.Params(**{name: chosen[name] for name in CHOSEN})
 
 
 def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any]:
@@ -57,18 +57,13 @@ def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any
         crew.seat(shut, drivers.TEACHER), hexapod.build(), rooms, settings.calibration_seconds, "calibrate", draw=False
     )
     record = rollout.together(list(walks))
-    thresholds = jnp.asarray(calibration.THRESHOLDS)
-    print("calibrate: drawing the walks for all candidates of T_s", flush=True)
-    excitation, feed_forward = calibration.survey(
-        lgmd.Params(), crew.eyes(settings.eyes), rooms.arena, record, thresholds
-    )
-    choice = calibration.choose(record, np.asarray(excitation), np.asarray(feed_forward), np.asarray(thresholds))
-    detector = {"inhibition": lgmd.Params().inhibition, "overlap": settings.eyes.overlap}
-    table = [row | detector | {"suppression": choice.suppression} for row in choice.table]
-    chosen = {"threshold": choice.threshold, "suppression": choice.suppression}
-    return {**chosen, **detector, "table": table}
+    candidates = calibration.grid()
+    print("calibrate: drawing the walks for all candidates of T_s and W_I", flush=True)
+    u, feed_forward = calibration.survey(lgmd.Params(), crew.eyes(settings.eyes), rooms.arena, record, candidates)
+    choice = calibration.choose(record, np.asarray(u), np.asarray(feed_forward), candidates)
+    return dataclasses.asdict(choice) | {"overlap": settings.eyes.overlap}
 
 
 def _parameters(settings: scales.Collect, detector: lgmd.Params) -> dict[str, Any]:
-    thresholds = {"threshold": detector.threshold, "suppression": detector.suppression}
-    return {"eyes": dataclasses.asdict(settings.eyes), "seconds": settings.seconds, "lgmd": thresholds}
+    constants = {name: getattr(detector, name) for name in CHOSEN}
+    return {"eyes": dataclasses.asdict(settings.eyes), "seconds": settings.seconds, "lgmd": constants}
