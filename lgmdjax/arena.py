@@ -132,12 +132,12 @@ def mirror(arena: Arena) -> Arena:
 
 
 def clearance(
-    arena: Arena, starts: Float[Array, "s 3"], ends: Float[Array, "s 3"], radii: Float[Array, " s"]
+    arena: Arena, starts: Float[Array, "s axes"], ends: Float[Array, "s axes"], radii: Float[Array, " s"]
 ) -> Float[Array, " s"]:
     """Measure the signed distance [m] of capsules to the nearest obstacle or wall, negative inside.
 
     Exact, and a problem in the plane, since what stands on the floor is higher than the robot and what hangs
-    overhead cannot be touched; the floor does not count.
+    overhead cannot be touched; the floor does not count. Of the ends (x, y) is enough.
     Gradient: that of the nearest feature; zero where a cylinder's axis cuts a capsule's.
     """
     p, q = starts[..., :2], ends[..., :2]

@@ -78,7 +78,7 @@ def vehicle_3a(stimuli: Float[Array, "2"], base: Scalar, gain: Scalar) -> Float[
     return base - gain * stimuli
 
 
-def vehicle_3b(stimuli: Float[Array, "2"], base: Scalar, gain: Scalar) -> Float[Array, "2"]:
+def vehicle_3b(stimuli: Float[Array, "2"], base: Float[Array, "2"] | Scalar, gain: Scalar) -> Float[Array, "2"]:
     """Inhibit each side by the other's sensor (eq. 21): turns away from what it senses, slower."""
     return base - gain * stimuli[::-1]
 

@@ -12,8 +12,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls its own tuning flags errors
 
 import jax
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
@@ -27,7 +27,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Put the check of shapes in place before any test imports the package."""
     if config.getoption("--shapes"):
-        install_import_hook("lgmdjax", "shapecheck.check")
+        jaxtyping.install_import_hook("lgmdjax", "shapecheck.check")
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Let arguments of a wrong type through to the package, which refuses them in its own words."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

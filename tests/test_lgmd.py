@@ -207,6 +207,7 @@ def test_a_hemifield_that_is_none_is_refused(side, overlap):
         lgmd.hemifield(np.zeros((4, 8)), side, overlap)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_pictures_that_do_not_fit_are_refused():
     params, picture = lgmd.Params(), jnp.zeros((6, 8))
     state = lgmd.init(params, picture)

@@ -150,6 +150,7 @@ def test_another_kind_of_file_or_version_is_refused(good):
     assert "another kind" in refused(good)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_contents_that_do_not_fit_are_refused(good):
     whole = good.read_bytes()
     for broken in (
@@ -179,6 +180,7 @@ def test_nothing_is_left_where_nothing_can_be_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_variant_that_is_none_is_refused():
     with pytest.raises(InputError, match=json.dumps("gru").replace('"', "'")):
         navigator.create(jax.random.key(0), "gru")  # pyright: ignore[reportArgumentType]
