@@ -305,13 +305,13 @@ def losses(curves: Mapping[str, Mapping[str, Sequence[float]]], names: Mapping[s
             else:
                 epochs = np.arange(1, len(curve[half]) + 1)
                 axes.plot(epochs, curve[half], color=colour, linewidth=1.1, label=label)
-    for axes, title in zip(panels, ("training half", "test half"), strict=True):
+    for axes, title in zip(panels, ("training", "test"), strict=True):
         axes.set(title=title, xlabel="epoch", yscale="log", xlim=(0, max(last, 2)))
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
     panels[0].set_ylabel("mean squared error [(0.05 m/s)²]")
-    figure.legend(handles=panels[0].get_legend_handles_labels()[0], loc="outside upper left", ncols=4)
+    figure.legend(handles=panels[0].get_legend_handles_labels()[0], loc="outside upper left", ncols=3)
     return figure
 
 

@@ -43,7 +43,8 @@ LOOKS_AT = {
     "random": "nothing",
 }
 LEARNERS = {
-    "lstm": "LSTM (the paper's)",
+    "lstm": "LSTM",
+    "lstm-halves": "LSTM, teacher's walks halved (as in the paper)",
     "lstm-efference": "LSTM, last command too",
     "feed-forward": "feed-forward",
     "mean": "mean command",

@@ -144,7 +144,7 @@ def test_chosen_threshold_is_the_one_marked(run: Path, drawn: dict[str, Figure])
 
 
 def test_losses_are_on_one_log_axis_with_the_constant_as_a_level(drawn: dict[str, Figure]):
-    training, test = panel(drawn["losses"], "training half"), panel(drawn["losses"], "test half")
+    training, test = panel(drawn["losses"], "training"), panel(drawn["losses"], "test")
     assert training.get_yscale() == "log"
     assert training.get_ylim() == test.get_ylim()
     assert [line.get_label() for line in test.lines] == ["lstm", "lstm-efference", "feed-forward", "mean"]

@@ -36,25 +36,25 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
     walks, header = recorded, episodes.parameters(inputs["collect"] / "episodes")
     for number in range(settings.rounds):
         walks = walks + _own_walks(folder, inputs, settings, seed, number, walks)
-    # By room, not in halves of a stretch as the paper's: a stretch ends where the robot touched something, so that
-    # its second half is what a controller must learn most.
+    # By room. The paper halves every stretch; but a stretch ends where the robot touched something, so that its
+    # second half is what a controller must learn most. One fit to the teacher's walks in halves stands beside.
     train, kept = training.split_by_room(walks, KEPT_BACK, seed)
     test, unseen = training.split_by_room(kept, 0.5, seed)
-    fits = {
-        variant: training.fit(
-            navigator.create(jax.random.key(seed), variant),
-            train,
-            test,
-            training.Settings(epochs=settings.epochs if variant != "mean" else 1),
-            checkpoints=folder / "checkpoints" / variant,
-        )
-        for variant in navigator.VARIANTS
-    }
+
+    def fit(name: str, variant: navigator.Variant, *walks: Sequence[Walk]) -> training.Fit:
+        epochs = training.Settings(epochs=settings.epochs if variant != "mean" else 1)
+        start = navigator.create(jax.random.key(seed), variant)
+        return training.fit(start, *walks, epochs, checkpoints=folder / "checkpoints" / name)
+
+    fits = {variant: fit(variant, variant, train, test) for variant in navigator.VARIANTS}
+    shown = {walk.room for walk in train}
+    fits["lstm-halves"] = fit("lstm-halves", "lstm", *training.halve([w for w in recorded if w.room in shown]))
     sets = {"train": train, "test": test, "unseen": unseen}
     curves = {variant: {"train": fit.train.tolist(), "test": fit.test.tolist()} for variant, fit in fits.items()}
     minutes = {name: sum(map(len, some)) / FRAME_RATE / 60 for name, some in sets.items()}
     table = training.table({variant: fit.best for variant, fit in fits.items()}, sets)
-    write_json(folder / "training.json", {"curves": curves, "table": table, "minutes": minutes})
+    result = {"curves": curves, "table": table, "minutes": minutes, "caution": training.CAUTION}
+    write_json(folder / "training.json", result)
     learned = training.enliven(fits["lstm"].best, test)
     navigator.save(
         folder / "controller.safetensors", learned, header | {"seed": seed, "training": dataclasses.asdict(settings)}
