@@ -263,7 +263,7 @@ def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
     by_x, along_x, along_y = _walls(arena, eye, pixels.d)
     wall_s, other_s = choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)
     slopes = _slopes(wall_s, pixels)
-    part = _part_of_nearer(wall_s, other_s, pixels)
+    part, corner_shift = _part_of_nearer(wall_s, other_s, pixels)
     floor_rise, floor_shift = _rise(-eye[2], slopes, pixels)
     top_rise, top_shift = _rise(arena.wall_height - eye[2], slopes, pixels)
     floor, sky = _clip(0.5 + floor_rise), _clip(0.5 - top_rise)
@@ -279,10 +279,13 @@ def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
     on_edge = floor > sky
 
     down, up = jnp.where(floor_first, 0.5 * (1.0 - floor), -0.5 * floor), 0.5 * sky
-    shift = tuple(down * a + up * b for a, b in zip(floor_shift, top_shift, strict=True))
+    aside = jnp.where(floor_first | on_edge, 0.0, 0.5 * (1.0 - part))
+    shift_u, shift_v = (
+        down * a + up * b + aside * c for a, b, c in zip(floor_shift, top_shift, corner_shift, strict=True)
+    )
 
     def layer(cover: Array, s: Vector, row: Texture) -> Layer:
-        return Layer(nearness, cover, shift, s, (-eye[0], -eye[1]), row)
+        return Layer(nearness, cover, (shift_u, shift_v), s, (-eye[0], -eye[1]), row)
 
     zero = jnp.zeros_like(part)
     as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / jnp.maximum(eye[2], NEAR)), floor_row)
@@ -308,10 +311,11 @@ def _walls(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
     return s_x * d[0] > s_y * d[1], (s_x, zero), (zero, s_y)
 
 
-def _part_of_nearer(wall: Pair, other: Pair, pixels: Rays) -> Array:
-    """Part of a pixel that the nearer of two walls has, the rest being beyond the upright edge between them."""
+def _part_of_nearer(wall: Pair, other: Pair, pixels: Rays) -> tuple[Array, Pair]:
+    """Part of a pixel that the nearer of two walls has, the rest being round the corner, and the way to more of it."""
     m, m_u, m_v = _slopes((wall[0] - other[0], wall[1] - other[1]), pixels)
-    return _clip(0.5 + m / _width(m_u, m_v))
+    inverse = _once(1.0 / _width(m_u, m_v))
+    return _clip(0.5 + m * inverse), (m_u * inverse, m_v * inverse)
 
 
 def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int) -> Array:
