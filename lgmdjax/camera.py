@@ -26,7 +26,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from lgmdjax import layers, silhouettes
+from lgmdjax import layers, lgmd, silhouettes
 from lgmdjax.arena import Arena
 from lgmdjax.errors import InputError
 from lgmdjax.texture import WAVES
@@ -70,7 +70,7 @@ class Params:
 
 def shape(params: Params) -> tuple[int, int, int]:
     """Return the shape of a stereo pair: eyes, rows, columns."""
-    return 2, params.height, round(params.overlap * params.width)
+    return 2, params.height, lgmd.columns(params.width, params.overlap)
 
 
 def render(
@@ -82,7 +82,7 @@ def render(
     """Draw what the left and the right eye see, in grey levels 0..255.
 
     `positions` [m] and `rotations` (from the eye's frame to the world; one for both will do) are the eyes' poses. The
-    left eye draws its columns [0, overlap * width), the right eye the last overlap * width.
+    left eye draws its first columns, the right eye its last ones, as many as `shape` says.
     Gradient: through outlines, by what they cover, and through depths and textures; zero through which prisms a tile
     knows of.
     """

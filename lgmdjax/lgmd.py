@@ -180,6 +180,11 @@ def excitations(
     return State(frame=frame, difference=cells.difference), response
 
 
+def columns(width: int, overlap: float) -> int:
+    """Count the columns of a picture that one eye looks at: so many that the two eyes leave none out between them."""
+    return math.ceil(overlap * width - 1e-9)  # less than a rounding error is no column
+
+
 def hemifield(picture: Array | np.ndarray, side: int, overlap: float) -> Array | np.ndarray:
     """Cut out what one eye looks at: the left eye the first columns, the right eye the last ones.
 
@@ -195,7 +200,7 @@ def hemifield(picture: Array | np.ndarray, side: int, overlap: float) -> Array |
     if side not in (LEFT, RIGHT):
         raise InputError(f"lgmd side: expected 0 (left) or 1 (right), got {side}; see lgmd.LEFT, lgmd.RIGHT")
     width = jnp.shape(picture)[-1]
-    kept = math.ceil(overlap * width)
+    kept = columns(width, overlap)
     return picture[..., :kept] if side == LEFT else picture[..., width - kept :]
 
 
