@@ -112,7 +112,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
     Gradient: see the module; |.| of eqs. 8, 10 and 13 has slope 0 at 0.
     """
     cells = layers(params, state, frame)
-    U = mean_excitation(params, cells.summation, params.threshold)
+    U = _mean_excitation(params, cells.summation)
     FF = _feed_forward(params, state.difference)
     u = STILL + _pass(params, FF) * (jax.nn.sigmoid(U) - STILL)
     return State(frame=frame, difference=cells.difference), Response(u=u, feed_forward=FF, excitation=U)
@@ -152,32 +152,12 @@ def inhibit(
     return moved(inner, 0) + moved(near, 1) + moved(near, -1) + moved(far, 2) + moved(far, -2)
 
 
-def mean_excitation(
-    params: Params, summation: Float[Array, "height width"], threshold: Float[Array, ""] | float
-) -> Float[Array, ""]:
+def _mean_excitation(params: Params, summation: Float[Array, "height width"]) -> Float[Array, ""]:
     """Average what passes T_s over the cells (eqs. 12, 13, and the division of eq. 14) [grey]."""
-    S, margin = summation, summation - threshold
+    S, margin = summation, summation - params.threshold
     soft = params.smooth
     passed = S * jax.nn.sigmoid(margin / params.threshold_width) if soft else jnp.where(margin >= 0, S, 0.0)
     return _mean(jnp.abs(passed))
-
-
-def excitations(
-    params: Params,
-    state: State,
-    frame: Float[Array, "height width"],
-    thresholds: Float[Array, "candidates"],
-) -> tuple[State, Response]:
-    """Show the next picture to many detectors that differ in T_s only, at little more than the price of one.
-
-    Everything before the threshold is evaluated once. The response's `u` and `excitation` have an axis of
-    candidates; the gate is left open, since T_f is chosen afterwards (`lgmdjax.calibration`).
-    """
-    cells = layers(params, state, frame)
-    U = lax.map(lambda threshold: mean_excitation(params, cells.summation, threshold), thresholds)
-    FF = _feed_forward(params, state.difference)
-    response = Response(u=jax.nn.sigmoid(U), feed_forward=FF, excitation=U)
-    return State(frame=frame, difference=cells.difference), response
 
 
 def columns(width: int, overlap: float) -> int:

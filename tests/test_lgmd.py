@@ -168,20 +168,6 @@ def test_gradient_is_finite_where_nothing_moves(smooth):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
-def test_many_thresholds_in_one_pass_equal_many_passes():
-    thresholds, frames = jnp.asarray([0.0, 5.0, 20.0, 90.0]), jnp.asarray(noise(4, HEIGHT, WIDTH))
-    params, step = lgmd.Params(suppression=1e9), jax.jit(lgmd.step)
-    state = lgmd.init(params, frames[0])
-    for frame in frames[1:]:
-        together, response = jax.jit(lgmd.excitations)(params, state, frame, thresholds)
-        for k, threshold in enumerate(thresholds):
-            after, one = step(replace(params, threshold=threshold), state, frame)
-            np.testing.assert_allclose(response.excitation[k], one.excitation, rtol=1e-12)
-            np.testing.assert_allclose(response.u[k], one.u, rtol=1e-12)
-            np.testing.assert_array_equal(after.difference, together.difference)
-        state = together
-
-
 def test_mirrored_pictures_give_the_same_response():
     frames = jnp.asarray(noise(5, 20, 31))
     for flipped in (frames[:, :, ::-1], frames[:, ::-1]):
