@@ -155,7 +155,7 @@ def _to_cylinders(cylinders: Prisms, p: Array, q: Array) -> Array:
     return jnp.where(is_overhead(cylinders), jnp.inf, distance_to_cylinders(cylinders, p, q))
 
 
-def is_overhead(prisms: Prisms) -> Bool[Array, " n"]:
+def is_overhead(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
     """Tell which prisms hang above the robot."""
     return prisms.bottom >= ROBOT_HEIGHT
 
@@ -200,12 +200,14 @@ def margins(arena: Arena, poses: Float[Array, "n 3"], ahead: float = 0.3) -> Flo
     return clearance(arena, xy, front, jnp.zeros_like(yaw))
 
 
-def free_pose(key: Array, arena: Arena, margin: float = 0.45) -> Float[Array, "3"]:
+def free_pose(key: Array, arena: Arena, margin: Float[Array, ""] | float = 0.45) -> Float[Array, "3"]:
     """Draw one pose (x, y, yaw) as `free_poses` does."""
     return free_poses(key, arena, 1, margin)[0]
 
 
-def free_poses(key: Array, arena: Arena, count: int, margin: float = 0.45) -> Float[Array, "count 3"]:
+def free_poses(
+    key: Array, arena: Arena, count: int, margin: Float[Array, ""] | float = 0.45
+) -> Float[Array, "count 3"]:
     """Draw poses (x, y, yaw), each uniform among those whose `margins` are at least `margin` [m].
 
     Of 64 candidates the first free one; where none is, the room's own `start`: no pose is a bad one.

@@ -20,6 +20,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
@@ -106,7 +107,7 @@ def parked(count: int = COUNT) -> Prisms:
     )
 
 
-def is_parked(prisms: Prisms) -> Bool[Array, " n"]:
+def is_parked(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
     """Tell which prisms are padding."""
     return prisms.top <= 0
 
