@@ -39,7 +39,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE, Record
 
 THRESHOLDS = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # candidates for T_s, grey
-INHIBITIONS = (0.2, 0.4, 0.6)  # candidates for W_I; the paper's is 0.4
+INHIBITIONS = (0.1, 0.2, 0.3, 0.4)  # candidates for W_I; the paper's is 0.4
 AVERAGED = 0.8  # s, about a gait cycle
 MARGIN = 1.25  # T_f over the greatest FF of walking
 
