@@ -139,7 +139,8 @@ def sense(
     nerves = state.controller
 
     # One program for both, which takes half a minute to compile; the choice is the same for a whole crowd. Only the
-    # drawing is in it, since XLA would else draw anew inside each of the loops that read the picture.
+    # drawing is in it, since XLA would else draw anew inside each of the loops that read the picture, each time with
+    # other last bits; `episodes.redraw` gives the same ones.
     frames = jax.lax.cond(
         draw,
         lambda: camera.render(params.camera, scene, *hexapod.eye_poses(pose)),

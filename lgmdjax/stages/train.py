@@ -41,14 +41,15 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
     train, kept = training.split_by_room(walks, KEPT_BACK, seed)
     test, unseen = training.split_by_room(kept, 0.5, seed)
 
-    def fit(name: str, variant: navigator.Variant, *walks: Sequence[Walk]) -> training.Fit:
+    def fit(name: str, variant: navigator.Variant, train: list[Walk], test: list[Walk]) -> training.Fit:
         epochs = training.Settings(epochs=settings.epochs if variant != "mean" else 1)
         start = navigator.create(jax.random.key(seed), variant)
-        return training.fit(start, *walks, epochs, checkpoints=folder / "checkpoints" / name)
+        return training.fit(start, train, test, epochs, checkpoints=folder / "checkpoints" / name)
 
-    fits = {variant: fit(variant, variant, train, test) for variant in navigator.VARIANTS}
+    fits = {str(variant): fit(variant, variant, train, test) for variant in navigator.VARIANTS}
     shown = {walk.room for walk in train}
-    fits["lstm-halves"] = fit("lstm-halves", "lstm", *training.halve([w for w in recorded if w.room in shown]))
+    first, second = training.halve([walk for walk in recorded if walk.room in shown])
+    fits["lstm-halves"] = fit("lstm-halves", "lstm", first, second)
     sets = {"train": train, "test": test, "unseen": unseen}
     curves = {variant: {"train": fit.train.tolist(), "test": fit.test.tolist()} for variant, fit in fits.items()}
     minutes = {name: sum(map(len, some)) / FRAME_RATE / 60 for name, some in sets.items()}
