@@ -1,4 +1,4 @@
-"""One frame, and walks made of it: mirrored, differentiated, set back, frozen."""
+"""One frame, and walks made of it: mirrored, set back, frozen."""
 
 from dataclasses import replace
 
@@ -162,42 +162,3 @@ def test_chunks_of_a_crowd_are_one_walk(params, model):
     state = simulation.init(crowd, model, one, drivers.ANYONE)
     _, alone = jax.jit(lambda s: rollout.walk(crowd, model, one, s, drivers.ANYONE, 30, False))(state)
     np.testing.assert_allclose(short.position[1], alone.position, atol=1e-8)
-
-
-def test_reverse_and_forward_mode_agree_on_the_command_error_of_a_frame(params, model, room):
-    """Every leaf of LGMD, navigator, CPG and shaping network is reached: through legs, body, eyes and rule."""
-    soft = hexapod.differentiable(model, soft=True)
-    smooth = params.controller.lgmd.replace(suppression_width=jnp.asarray(10.0))
-    nerves = params.controller.replace(
-        lgmd=smooth,
-        driver=navigator.create(jax.random.key(3)),
-        # In one Runge-Kutta step: four take long to compile, and are tested by themselves.
-        cpg=params.controller.cpg.replace(substeps=1),
-    )
-
-    def frame(nerves, state):
-        # From a step to the next command, so that what moves the legs comes before what the eyes see.
-        own = params.replace(controller=nerves)
-        state, _ = simulation.move(own, soft, room.arena, state)
-        state, senses = simulation.sense(own, room.arena, state)
-        state, label = simulation.decide(own, state, senses, drivers.LEARNED)
-        return jnp.mean((state.controller.velocity - jax.lax.stop_gradient(label)) ** 2), state
-
-    reverse = jax.jit(jax.grad(frame, has_aux=True))
-    forward = jax.jit(lambda nerves, along, state: jax.jvp(lambda p: frame(p, state)[0], (nerves,), (along,))[1])
-
-    state = simulation.init(params.replace(controller=nerves), soft, room, drivers.LEARNED)
-    for _ in range(4):  # the eyes need three pictures before all of their layers are awake
-        before = state
-        gradient, state = reverse(nerves, before)
-
-    paths, structure = jax.tree.flatten_with_path(gradient)
-    rng = np.random.default_rng(0)
-    for at, (path, leaf) in enumerate(paths):
-        name = jax.tree_util.keystr(path)
-        assert np.all(np.isfinite(leaf)), name
-        assert np.any(leaf != 0), name
-        along = [jnp.zeros_like(other) for _, other in paths]
-        along[at] = jnp.asarray(rng.normal(size=leaf.shape))
-        slope = forward(nerves, jax.tree.unflatten(structure, along), before)
-        np.testing.assert_allclose(jnp.vdot(leaf, along[at]), slope, rtol=1e-6, err_msg=name)
