@@ -10,7 +10,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from lgmdjax import scenes, simulation
@@ -89,7 +89,7 @@ STARTS = 32  # places where a room's robot is put down, one after the other
 
 
 @partial(jax.jit, static_argnames="count")
-def random_rooms(key: Array, count: int, density: float = 0.15) -> Room:
+def random_rooms(key: Array, count: int, density: Float[Array, ""] | float = 0.15) -> Room:
     """Draw rooms that a key alone decides, each with its starts; the same key and index give the same room."""
 
     def room(key: Array) -> Room:
@@ -101,7 +101,7 @@ def random_rooms(key: Array, count: int, density: float = 0.15) -> Room:
 
 
 @partial(jax.jit, static_argnames="count")
-def copies(key: Array, arena: Arena, count: int, spread: float = jnp.pi) -> Room:
+def copies(key: Array, arena: Arena, count: int, spread: Float[Array, ""] | float = jnp.pi) -> Room:
     """Give every robot of a crowd the same room: first its own start, turned by up to `spread`, then free ones."""
 
     def room(key: Array) -> Room:

@@ -233,7 +233,12 @@ def table(
 
 @partial(jax.jit, static_argnames="settings")
 def _advance(
-    params: navigator.Params, progress: Progress, train: Tape, test: Tape, epochs: int, settings: Settings
+    params: navigator.Params,
+    progress: Progress,
+    train: Tape,
+    test: Tape,
+    epochs: Int[Array, ""] | int,
+    settings: Settings,
 ) -> Progress:
     """Walk the tapes some epochs on; a number of epochs that is no constant of the program."""
     return jax.lax.fori_loop(0, epochs, lambda _, p: _epoch(params, p, train, test, settings), progress)

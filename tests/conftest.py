@@ -1,4 +1,4 @@
-"""What every test runs under: float64, strict types on request, a compilation cache that outlives the run."""
+"""What every test runs under: float64, checked shapes, a compilation cache that outlives the run."""
 
 import os
 from collections.abc import Iterator
@@ -21,12 +21,12 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--shapes", action="store_true", help="check every annotated shape while the tests run")
+    parser.addoption("--no-shapes", action="store_true", help="do not check every annotated shape and type")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Put the check of shapes in place before any test imports the package."""
-    if config.getoption("--shapes"):
+    if not config.getoption("--no-shapes"):
         jaxtyping.install_import_hook("lgmdjax", "shapecheck.check")
 
 

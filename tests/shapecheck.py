@@ -1,6 +1,6 @@
 """Checks what the package's functions are given and give back against their annotations, shapes included.
 
-jaxtyping's import hook calls `check` on every function of the package (`pytest --shapes`).
+jaxtyping's import hook calls `check` on every function of the package, unless `pytest --no-shapes` asks not to.
 """
 
 from collections.abc import Callable
