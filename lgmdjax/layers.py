@@ -9,9 +9,10 @@ arrays of their own for the same reason.
 | d_u, d_v | its change from column to column, row to row | 1/px |                                                |
 | s        | surface as inverse depth, 1/t = s . d        | 1/m  | `silhouettes`                                  |
 | m        | margin by which a ray is inside an outline   |      |                                                |
-| w        | width over which a pixel smears an edge      |      | max + min/2 of abs(dm/du), abs(dm/dv)          |
-| a        | part of a pixel that is inside               | 1    | clip(1/2 + m/w, 0, 1), exact if straight along |
-|          |                                              |      | rows or columns, to 0.06 if aslant             |
+| p, q     | the larger and the smaller slope of m        | 1/px | of abs(dm/du), abs(dm/dv)                      |
+| k        | slant of an edge                             | 1    | q/p: 0 along rows or columns, 1 halfway        |
+| a        | part of a pixel that is inside               | 1    | `_part` of m/p and k, exact; at the ends of    |
+|          |                                              |      | prisms `_ramp`, to 0.07                        |
 """
 
 import functools
@@ -46,10 +47,10 @@ class Rays(NamedTuple):
     d_v: Vector
     level_square: Array
     """d_x^2 + d_y^2."""
-    width: Array
-    """w of (d_x, d_y) across upright edges."""
+    slant: "_Slant"
+    """Of upright edges."""
     across: Pair
-    """(d_x, d_y)/w for upright edges: times a plane's unit normal, the margin in pixels."""
+    """(d_x, d_y)/p for upright edges: times a plane's unit normal, the margin in pixels."""
     rightward: Pair
     """Columns and rows to the right, across upright edges, for a pixel of margin."""
     turn: Pair
@@ -75,12 +76,12 @@ def rays(d: Vector, d_u: Vector, d_v: Vector) -> Rays:
     """Complete rays given by their directions and how these change."""
     level_square = d[0] * d[0] + d[1] * d[1] + 1e-12
     m_u, m_v = d[1] * d_u[0] - d[0] * d_u[1], d[1] * d_v[0] - d[0] * d_v[1]
-    width = _width(m_u, m_v)
-    inverse = _once(1.0 / width)
+    slant = _slant(m_u, m_v)
+    inverse = slant.per_p
     per_pixel = _once(jnp.sqrt(level_square)) * inverse
     across, (right_u, right_v) = (d[0] * per_pixel, d[1] * per_pixel), (m_u * inverse, m_v * inverse)
     turn = right_u * d_u[0] + right_v * d_v[0], right_u * d_u[1] + right_v * d_v[1]
-    return Rays(d, d_u, d_v, level_square, width, across, (right_u, right_v), turn)
+    return Rays(d, d_u, d_v, level_square, slant, across, (right_u, right_v), turn)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
@@ -159,8 +160,9 @@ def _plain(layer: Layer) -> _Plain:
 def _prism(prism: Silhouette, pixels: Rays) -> Layer:
     """What a prism covers of each pixel, and with which face."""
     d, (across_x, across_y) = pixels.d, pixels.across
-    left = _clip(prism.left[0] * across_x + prism.left[1] * across_y + prism.open)
-    right = _clip(prism.right[0] * across_x + prism.right[1] * across_y + prism.open)
+    beyond = (prism.open - 0.5) * _OPEN
+    left = _part(prism.left[0] * across_x + prism.left[1] * across_y + beyond, pixels.slant)
+    right = _part(prism.right[0] * across_x + prism.right[1] * across_y + beyond, pixels.slant)
     by_side = 0.5 * (right - left)
     near, far = _sides(prism, pixels, by_side)
     side = _slopes(near, pixels)
@@ -170,8 +172,8 @@ def _prism(prism: Silhouette, pixels: Rays) -> Layer:
     upward = jnp.where(prism.lid > 0, -1.0, 1.0).astype(prism.lid.dtype)
     lid_rise, lid_shift = _rise(prism.lid_end, last, pixels)
     other_rise, other_shift = _rise(prism.other_end, side, pixels)
-    to_lid = _clip(upward * lid_rise + jnp.where(within & lidless, _OPEN, 0.5))
-    to_other = _clip(jnp.where(within, _OPEN, 0.5) - upward * other_rise)
+    to_lid = _ramp(upward * lid_rise + jnp.where(within & lidless, _OPEN, 0.0))
+    to_other = _ramp(jnp.where(within, _OPEN, 0.0) - upward * other_rise)
     by_lid_end, by_other_end = 0.5 * upward * (1.0 - to_lid), 0.5 * upward * (to_other - 1.0)
     shift_u, shift_v = (
         by_lid_end * lid_shift[i] + by_other_end * other_shift[i] + by_side * pixels.rightward[i] for i in (0, 1)
@@ -198,7 +200,7 @@ def _sides(prism: Silhouette, pixels: Rays, shift: Array) -> tuple[Pair, Pair]:
     none = jnp.where(between_x, _OPEN, 0.0) - jnp.where(between_y, _OPEN, 0.0)
     near = choose(near_x * along + none < near_y * aside, (near_x * c, near_x * s), (-near_y * s, near_y * c))
     far = choose(far_x * along > far_y * aside, (far_x * c, far_x * s), (-far_y * s, far_y * c))
-    near_round, far_round = _round_sides(prism, x, y, pixels.width)
+    near_round, far_round = _round_sides(prism, x, y, pixels.slant.p)
     is_round = prism.radius_square > 0
     return choose(is_round, near_round, near), choose(is_round, far_round, far)
 
@@ -234,15 +236,63 @@ def _slopes(s: Pair, pixels: Rays) -> Vector:
 
 
 def _rise(z: Array, slopes: Vector, pixels: Rays) -> tuple[Array, Pair]:
-    """Margin in pixels by which rays pass below the height z on a face, m = z/t - d_z, and the way to more of it."""
-    m, m_u, m_v = (z * a - d[2] for a, d in zip(slopes, (pixels.d, pixels.d_u, pixels.d_v), strict=True))
-    inverse = _once(1.0 / _width(m_u, m_v))
+    """Margin in pixels by which rays pass below the height z on a face, and the way to more of it."""
+    m, m_u, m_v = _below(z, slopes, pixels)
+    across, along = jnp.abs(m_u), jnp.abs(m_v)
+    # Aslant an edge is smeared farther; of straight ramps this one is the nearest.
+    inverse = _once(1.0 / (jnp.maximum(across, along) + 0.2 * jnp.minimum(across, along) + 1e-9))
     return m * inverse, (m_u * inverse, m_v * inverse)
 
 
-def _width(m_u: Array, m_v: Array) -> Array:
+def _part_below(z: Array, slopes: Vector, pixels: Rays) -> tuple[Array, Pair]:
+    """Part of a pixel that is below the height z on a face, and the way to more of it."""
+    return _part_and_way(_below(z, slopes, pixels))
+
+
+def _below(z: Array, slopes: Vector, pixels: Rays) -> Vector:
+    """m = z/t - d_z on a face, and its slopes."""
+    m, m_u, m_v = (z * a - d[2] for a, d in zip(slopes, (pixels.d, pixels.d_u, pixels.d_v), strict=True))
+    return m, m_u, m_v
+
+
+class _Slant(NamedTuple):
+    """How an edge lies in a pixel: p, 1/p, k/2 and 1/k."""
+
+    p: Array
+    per_p: Array
+    half: Array
+    inverse: Array
+
+
+def _slant(m_u: Array, m_v: Array) -> _Slant:
     m_u, m_v = jnp.abs(m_u), jnp.abs(m_v)
-    return jnp.maximum(m_u, m_v) + 0.2 * jnp.minimum(m_u, m_v) + 1e-9
+    p = jnp.maximum(m_u, m_v) + 1e-9
+    q = jnp.maximum(jnp.minimum(m_u, m_v), 1e-3 * p)
+    both = _once(1.0 / (p * q))  # one division for all
+    return _Slant(p, q * both, 0.5 * q * q * both, p * p * both)
+
+
+def _part(margin: Array, slant: _Slant) -> Array:
+    """a: part of a pixel on the inner side of a straight edge that is m/p inside of its middle.
+
+    The other part, or where it is the larger this one, is a corner: a triangle of height x, cut at k.
+    """
+    x = jnp.maximum(0.5 + slant.half - jnp.abs(margin), 0.0)
+    cut = jnp.minimum(x, 2.0 * slant.half)
+    corner = slant.inverse * (x - 0.5 * cut) * cut
+    return jnp.where(margin > 0, 1.0 - corner, corner)
+
+
+def _part_and_way(margin: Vector) -> tuple[Array, Pair]:
+    """Part of a pixel where a margin, given with its slopes, is positive, and the way to more of it."""
+    m, m_u, m_v = margin
+    slant = _slant(m_u, m_v)
+    return _part(m * slant.per_p, slant), (m_u * slant.per_p, m_v * slant.per_p)
+
+
+def _ramp(margin: Array) -> Array:
+    """`_part` at half its price, for an edge whose margin is in units of its smear."""
+    return jnp.clip(0.5 + margin, 0.0, 1.0)
 
 
 class _Room(NamedTuple):
@@ -264,9 +314,9 @@ def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
     wall_s, other_s = choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)
     slopes = _slopes(wall_s, pixels)
     part, corner_shift = _part_of_nearer(wall_s, other_s, pixels)
-    floor_rise, floor_shift = _rise(-eye[2], slopes, pixels)
-    top_rise, top_shift = _rise(arena.wall_height - eye[2], slopes, pixels)
-    floor, sky = _clip(0.5 + floor_rise), _clip(0.5 - top_rise)
+    floor, floor_shift = _part_below(-eye[2], slopes, pixels)
+    below_top, top_shift = _part_below(arena.wall_height - eye[2], slopes, pixels)
+    sky = 1.0 - below_top
     wall = jnp.maximum(1.0 - floor - sky, 0.0)
 
     rows = texture.prepare(arena.wall_texture)
@@ -313,9 +363,7 @@ def _walls(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
 
 def _part_of_nearer(wall: Pair, other: Pair, pixels: Rays) -> tuple[Array, Pair]:
     """Part of a pixel that the nearer of two walls has, the rest being round the corner, and the way to more of it."""
-    m, m_u, m_v = _slopes((wall[0] - other[0], wall[1] - other[1]), pixels)
-    inverse = _once(1.0 / _width(m_u, m_v))
-    return _clip(0.5 + m * inverse), (m_u * inverse, m_v * inverse)
+    return _part_and_way(_slopes((wall[0] - other[0], wall[1] - other[1]), pixels))
 
 
 def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int) -> Array:
@@ -354,7 +402,3 @@ def choose(condition: Array, a, b):
 
 def _row(rows: Texture, i: int) -> Texture:
     return jax.tree.map(lambda a: a[i], rows)
-
-
-def _clip(x: Array) -> Array:
-    return jnp.clip(x, 0.0, 1.0)
