@@ -45,7 +45,7 @@ class Silhouette(NamedTuple):
     """n_l; zero where the eye is above or below the prism, within its wedge."""
     right: Pair
     open: Array
-    """Margin [px] added to n . d: half a pixel; 1 where the wedge is all around, 0 where there is no prism."""
+    """1/2: the wedge counts; 1: it is all around; 0: there is no prism."""
     lid_end: Array
     """z of the end with the lid; of the top if no lid is seen."""
     other_end: Array
@@ -62,7 +62,7 @@ class Silhouette(NamedTuple):
     radius_square: Array
     """r^2 of a cylinder, 0 for a box."""
     limb: Array
-    """r |o|: times 2 w, what q^2 is a pixel inside the limb (`layers`)."""
+    """r |o|: times 2 p, what q^2 is a pixel inside the limb (`layers`)."""
     power: Array
     """1/c."""
     texture: texture.Texture
@@ -86,11 +86,11 @@ def look(arena: Arena, eye: Float[Array, "3"]) -> tuple[Silhouette, Bounds]:
 
 
 def may_show(
-    silhouettes: Silhouette, bounds: Bounds, axes: Float[Array, "cones 3"], radii: Float[Array, " cones"]
+    silhouettes: Silhouette, bounds: Bounds, axes: Float[Array, "*cones 3"], radii: Float[Array, "*cones"]
 ) -> Array:
     """Tell which prisms (last axis) may show in cones of directions: no side of the outline shuts the cone out."""
-    radius = radii[:, None]
-    x, y, z = (axes[:, i, None] for i in range(3))
+    radius = radii[..., None]
+    x, y, z = (axes[..., i, None] for i in range(3))
     elevation = jnp.arcsin(jnp.clip(z, -1.0, 1.0))
     slack = jnp.sin(jnp.minimum(radius, 0.5 * jnp.pi))
     from_left = silhouettes.left[0] * x + silhouettes.left[1] * y > -slack

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from reference import camera as reference
 
-from lgmdjax import arena, camera, lgmd, scenes
+from lgmdjax import arena, camera, lgmd, rollout, scenes
 from lgmdjax.errors import InputError
 
 EYES = camera.Params()
 SMALL = camera.Params(width=48, height=36)
 FLIP = np.diag([1.0, -1.0, 1.0])
-SPREAD = 6  # of so many columns the slow reference draws one
+SPREAD = 16  # of so many columns the slow reference draws one
 ROOMS = {
     "training": scenes.training_room,
     "testing": scenes.testing_room,
@@ -66,8 +66,8 @@ def test_pictures_and_their_changes_are_those_of_64_rays_a_pixel(draw, name):
     change = ours[1] - ours[0], exact[1].grey - exact[0].grey
     correlation = np.corrcoef(change[0].ravel(), change[1].ravel())[0, 1]
     print(f"{name}: {error[edges].mean():.2f} grey at edges, {error.mean():.2f} overall, correlation {correlation:.3f}")
-    assert edges.sum() > 200
-    assert error[edges].mean() < 1.2
+    assert edges.sum() > 80
+    assert error[edges].mean() < 1.0
     assert error.mean() < 0.2
     assert correlation >= 0.9
     assert np.ptp(change[1]) > 5.0
@@ -137,23 +137,40 @@ def test_half_the_field_of_view_is_the_middle_at_twice_the_resolution(glance):
 def test_enough_slots_leave_nothing_out(glance):
     room = scenes.testing_room()
     pose = eyes_at(room.start)
-    count = int(camera.crowding(SMALL, room, *pose))
-    assert 1 < count <= 24
-    enough = camera.render(SMALL.replace(slots=count), room, *pose)
-    more = camera.render(SMALL.replace(slots=count + 2), room, *pose)
-    np.testing.assert_allclose(enough, more, atol=1e-6)
+    assert 1 < int(camera.crowding(SMALL, room, *pose)) <= SMALL.slots
+    more = jax.jit(partial(camera.render, SMALL.replace(slots=SMALL.slots + 6)))(room, *pose)
+    np.testing.assert_allclose(glance(room, *pose), more, atol=1e-6)
+
+
+@pytest.mark.parametrize(("width", "height"), [(48, 36), (80, 60), (320, 240)])
+def test_tiles_hold_what_may_show_in_them(width, height):
+    """From six places of 20 random rooms; where it is most, rare poses have one more (0.2 % of them)."""
+    eyes = camera.Params(width=width, height=height)
+    rooms = rollout.random_rooms(jax.random.key(3), 20)
+    offsets = jnp.array([[0.1, 0.0325, 0.17], [0.1, -0.0325, 0.17]])
+
+    def crowding(room, start):
+        (x, y, yaw), zero = start, jnp.zeros(())
+        c, s = jnp.cos(yaw), jnp.sin(yaw)
+        rotation = jnp.stack([jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.array([0.0, 0.0, 1.0])])
+        return camera.crowding(eyes, room, jnp.stack([x, y, zero]) + offsets @ rotation.T, rotation)
+
+    counts = jax.jit(jax.vmap(jax.vmap(crowding, (None, 0))))(rooms.arena, rooms.starts[:, :6])
+    assert np.mean(np.asarray(counts) <= eyes.slots) >= 0.99
+    assert np.max(counts) <= eyes.slots + 1
 
 
 def test_gradients_are_those_of_central_differences_in_both_modes():
     """Along the pose and along an obstacle's position, for the mean of a patterned weighting of the picture."""
     room = scenes.testing_room()
     positions, rotation = eyes_at(room.start)
-    weights = jnp.asarray(np.random.default_rng(0).normal(size=camera.shape(SMALL)))
+    tiny = SMALL.replace(width=24, height=18, overlap=1.0)
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=camera.shape(tiny)))
 
     def seen(positions, yaw, centre):
         moved = replace(room, boxes=replace(room.boxes, centre=centre))
         about_z = jnp.array([[jnp.cos(yaw), -jnp.sin(yaw), 0.0], [jnp.sin(yaw), jnp.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        return camera.render(SMALL, moved, positions, about_z @ rotation)
+        return camera.render(tiny, moved, positions, about_z @ rotation)
 
     at = jnp.asarray(positions), jnp.asarray(0.0), room.boxes.centre
     both = jax.jit(lambda at, along: jax.jvp(seen, at, along))
