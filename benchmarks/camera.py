@@ -14,6 +14,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 
@@ -147,14 +148,14 @@ def main() -> None:
         print(f"| {name:15s} | {wall:9.2f} | {processor:14.2f} | {wall / times['lgmdjax'][0]:13.2f} |")
     print("\n| pixels    | robots | obstacles | slots | wall [ms a pair] | memory [MB a pair] |")
     print("| --------- | ------ | --------- | ----- | ---------------- | ------------------ |")
-    small = EYES.replace(width=80, height=60)
+    small = replace(EYES, width=80, height=60)
     for eyes, robots, obstacles in (
         (small, 1, 24),
         (small, 16, 24),
         (small, 64, 24),
         (small, 16, 8),
-        (small.replace(slots=3), 16, 24),
-        (EYES.replace(width=160, height=120), 1, 24),
+        (replace(small, slots=3), 16, 24),
+        (replace(EYES, width=160, height=120), 1, 24),
         (EYES, 1, 24),
         (EYES, 4, 24),
     ):

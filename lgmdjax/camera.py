@@ -32,13 +32,15 @@ from lgmdjax.arena import Arena
 from lgmdjax.errors import InputError
 from lgmdjax.texture import WAVES
 
+Leaf = Array | np.ndarray
+
 _TILE = (math.radians(4.3), math.radians(8.6))
 """About how high and wide a tile is: small ones hold few prisms, wide ones are long loops."""
 _COARSE = 25.0
 """Pictures of fewer pixels a radian have tiles of 2 x 4 pixels at least, others of 4 x 8, which are twice as fast."""
 
 
-@struct.dataclass(kw_only=True)
+@struct.dataclass(kw_only=True, frozen=True)
 class Params:
     """The camera's structure, all of it static. Raises InputError where it cannot be."""
 
@@ -79,8 +81,8 @@ def shape(params: Params) -> tuple[int, int, int]:
 def render(
     params: Params,
     arena: Arena,
-    positions: Float[Array, "2 3"],
-    rotations: Float[Array, "2 3 3"] | Float[Array, "3 3"],
+    positions: Float[Leaf, "2 3"],
+    rotations: Float[Leaf, "2 3 3"] | Float[Leaf, "3 3"],
 ) -> Float[Array, "2 height columns"]:
     """Draw what the left and the right eye see, in grey levels 0..255.
 
@@ -89,7 +91,7 @@ def render(
     Gradient: through outlines, by what they cover, and through depths and textures; zero through which prisms a tile
     knows of.
     """
-    grid = _grid(params)
+    grid, positions = _grid(params), jnp.asarray(positions)
     grey = jax.vmap(functools.partial(_eye, params, arena), in_axes=(0, 0, grid.eyes))(
         positions, jnp.broadcast_to(rotations, (2, 3, 3)), grid.fields(positions.dtype)
     )
@@ -101,8 +103,8 @@ def render(
 def crowding(
     params: Params,
     arena: Arena,
-    positions: Float[Array, "2 3"],
-    rotations: Float[Array, "2 3 3"] | Float[Array, "3 3"],
+    positions: Float[Leaf, "2 3"],
+    rotations: Float[Leaf, "2 3 3"] | Float[Leaf, "3 3"],
 ) -> Int[Array, ""]:
     """Count the prisms that may show in the fullest tile of a stereo pair; with as many `slots` none is left out."""
     grid = _grid(params)
@@ -128,11 +130,11 @@ class _Field(NamedTuple):
 class _Grid(NamedTuple):
     """The fields of both eyes on the host, stacked; of one if they are the same."""
 
-    field: _Field
+    field: tuple[np.ndarray, ...]
     eyes: int | None
 
     def fields(self, dtype: jnp.dtype) -> _Field:
-        return jax.tree.map(lambda a: jnp.asarray(a, dtype), self.field)
+        return _Field(*(jnp.asarray(a, dtype) for a in self.field))
 
 
 @functools.lru_cache(maxsize=32)
@@ -141,10 +143,10 @@ def _grid(params: Params) -> _Grid:
     if columns == params.width:
         return _Grid(_field(params, 0), None)
     fields = _field(params, 0), _field(params, params.width - columns)
-    return _Grid(_Field(*(np.stack(pair) for pair in zip(*fields, strict=True))), 0)
+    return _Grid(tuple(np.stack(pair) for pair in zip(*fields, strict=True)), 0)
 
 
-def _field(params: Params, first: int) -> _Field:
+def _field(params: Params, first: int) -> tuple[np.ndarray, ...]:
     """Lay out the rays from column `first` on, a few beyond the picture where tiles do not fit into it."""
     n = params.samples
     f = n * params.width / params.fov
@@ -163,7 +165,7 @@ def _field(params: Params, first: int) -> _Field:
     # A pixel reaches farther than its ray, by half a diagonal.
     radii = np.arccos(np.clip(cosines, -1.0, 1.0)) + 0.75 / f
     tiles = rows * across
-    return _Field(d, d_u, d_v, np.moveaxis(axes, 0, -1).reshape(tiles, -1, 3), radii.reshape(tiles, -1))
+    return d, d_u, d_v, np.moveaxis(axes, 0, -1).reshape(tiles, -1, 3), radii.reshape(tiles, -1)
 
 
 def tile(length: int, wanted: float, least: int) -> int:

@@ -17,7 +17,7 @@ arrays of their own for the same reason.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ from lgmdjax import texture
 from lgmdjax.arena import Arena
 from lgmdjax.silhouettes import NEAR, Pair, Silhouette
 from lgmdjax.texture import Texture, Vector
+
+Arrays = TypeVar("Arrays")
 
 _FAR = 1.0e3
 """What is farther away [m] is shaded as if it were here."""
@@ -385,8 +387,11 @@ def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int
     u, v = layer.shift
     x, y, z = (p + u * a + v * b for p, a, b in zip(point, across, down, strict=True))
     width, height = 1.0 - 2.0 * jnp.abs(u), 1.0 - 2.0 * jnp.abs(v)
-    across, down = tuple(width * a for a in across), tuple(height * b for b in down)
-    return texture.grey(layer.texture, (x, y, z), across, down, bands)
+    return texture.grey(layer.texture, (x, y, z), _times(width, across), _times(height, down), bands)
+
+
+def _times(factor: Array, vector: Vector) -> Vector:
+    return factor * vector[0], factor * vector[1], factor * vector[2]
 
 
 def _once(quotient: Array) -> Array:
@@ -395,7 +400,7 @@ def _once(quotient: Array) -> Array:
     return jnp.minimum(quotient, 1e30)
 
 
-def choose(condition: Array, a, b):
+def choose(condition: Array, a: Arrays, b: Arrays) -> Arrays:
     """`where` over tuples of arrays."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 

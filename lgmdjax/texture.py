@@ -18,6 +18,8 @@ before its length falls below a pixel, and the mean brightness is kept.
 wave(x) = 8 x (1 - 2 |x|) for x in [-1/2, 1/2]: parabolas that look like a sine, at a third of its price.
 """
 
+import functools
+import operator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -76,4 +78,4 @@ def _kept(across: Array, down: Array) -> Array:
 
 
 def _dot(k: tuple[float, float, float], vector: Vector) -> Array:
-    return sum(a * b for a, b in zip(k, vector, strict=True) if a != 0.0)
+    return functools.reduce(operator.add, (a * b for a, b in zip(k, vector, strict=True) if a != 0.0))

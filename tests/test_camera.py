@@ -110,8 +110,8 @@ def test_a_crowd_sees_what_each_of_it_sees(glance):
 def test_overlap_cuts_the_same_columns_out(glance, overlap):
     room = scenes.indoor_scene()  # whose tiles, cut in another way, hold all there is
     pose = eyes_at(room.start)
-    whole, part = glance(room, *pose), camera.render(SMALL.replace(overlap=overlap), room, *pose)
-    assert part.shape == camera.shape(SMALL.replace(overlap=overlap))
+    whole, part = glance(room, *pose), camera.render(replace(SMALL, overlap=overlap), room, *pose)
+    assert part.shape == camera.shape(replace(SMALL, overlap=overlap))
     for side in (lgmd.LEFT, lgmd.RIGHT):
         np.testing.assert_allclose(part[side], lgmd.hemifield(whole[side], side, overlap), atol=1e-6)
 
@@ -119,8 +119,8 @@ def test_overlap_cuts_the_same_columns_out(glance, overlap):
 def test_samples_are_the_mean_of_a_finer_picture():
     room = scenes.testing_room()
     pose = eyes_at(room.start)
-    coarse = camera.render(SMALL.replace(samples=2), room, *pose)
-    fine = camera.render(SMALL.replace(width=96, height=72), room, *pose)
+    coarse = camera.render(replace(SMALL, samples=2), room, *pose)
+    fine = camera.render(replace(SMALL, width=96, height=72), room, *pose)
     assert coarse.shape == (2, 36, 48)
     np.testing.assert_allclose(coarse, fine.reshape(2, 36, 2, 48, 2).mean(axis=(2, 4)), atol=1e-6)
 
@@ -128,7 +128,7 @@ def test_samples_are_the_mean_of_a_finer_picture():
 def test_half_the_field_of_view_is_the_middle_at_twice_the_resolution(glance):
     room = scenes.testing_room()
     pose = eyes_at(room.start)
-    zoomed = camera.render(SMALL.replace(fov=SMALL.fov / 2), room, *pose)
+    zoomed = camera.render(replace(SMALL, fov=SMALL.fov / 2), room, *pose)
     averaged = np.asarray(zoomed).reshape(2, 18, 2, 24, 2).mean(axis=(2, 4))
     middle = np.asarray(glance(room, *pose))[:, 9:27, 12:36]
     assert np.abs(averaged - middle).mean() < 1.0 < np.abs(averaged - middle[:, ::-1]).mean()
@@ -138,7 +138,7 @@ def test_enough_slots_leave_nothing_out(glance):
     room = scenes.testing_room()
     pose = eyes_at(room.start)
     assert 1 < int(camera.crowding(SMALL, room, *pose)) <= SMALL.slots
-    more = jax.jit(partial(camera.render, SMALL.replace(slots=SMALL.slots + 6)))(room, *pose)
+    more = jax.jit(partial(camera.render, replace(SMALL, slots=SMALL.slots + 6)))(room, *pose)
     np.testing.assert_allclose(glance(room, *pose), more, atol=1e-6)
 
 
@@ -164,7 +164,7 @@ def test_gradients_are_those_of_central_differences_in_both_modes():
     """Along the pose and along an obstacle's position, for the mean of a patterned weighting of the picture."""
     room = scenes.testing_room()
     positions, rotation = eyes_at(room.start)
-    tiny = SMALL.replace(width=24, height=18, slots=3, bands=2)  # fewer make a shorter program
+    tiny = replace(SMALL, width=24, height=18, slots=3, bands=2)  # fewer make a shorter program
     weights = jnp.asarray(np.random.default_rng(0).normal(size=camera.shape(tiny)))
 
     def seen(positions, yaw, centre):

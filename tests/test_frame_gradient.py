@@ -3,6 +3,8 @@
 In a file of its own, since it takes minutes to compile.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,7 +60,7 @@ def test_reverse_and_forward_mode_agree_on_the_command_error_of_a_frame():
 
     def frame(nerves, state):
         # From a step to the next command, so that what moves the legs comes before what the eyes see.
-        own = params.replace(controller=nerves)
+        own = replace(params, controller=nerves)
         state, _ = simulation.move(own, soft, here.arena, state)
         state, senses = simulation.sense(own, here.arena, state)
         state, label = simulation.decide(own, state, senses, drivers.LEARNED)
