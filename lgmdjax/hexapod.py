@@ -113,16 +113,20 @@ def _anatomy() -> _Anatomy:
     model = load()
     names = [model.geom(i).name for i in range(model.ngeom)]
 
+    def numbers(ids: list[int]) -> np.ndarray:
+        # Of 32 bits in either precision: JAX remembers of an array of 64 the precision in which it met it first.
+        return np.array(ids, dtype=np.int32)
+
     def geoms(prefix: str) -> np.ndarray:
-        return np.array([i for i, name in enumerate(names) if name.startswith(prefix)])
+        return numbers([i for i, name in enumerate(names) if name.startswith(prefix)])
 
     limbs = [model.geom(f"{leg}_{part}").id for leg in LEGS for part in ("femur", "tibia")]
     return _Anatomy(
         stance=model.key("stance").qpos.copy(),
         eyes=np.stack([model.site(name).pos for name in EYES]),
         laser=model.site("laser").pos.copy(),
-        capsules=np.array([model.geom("bumper").id, *limbs]),
-        feet=np.array([model.geom(f"{leg}_foot").id for leg in LEGS]),
+        capsules=numbers([model.geom("bumper").id, *limbs]),
+        feet=numbers([model.geom(f"{leg}_foot").id for leg in LEGS]),
         boxes=geoms("slot_box_"),
         cylinders=geoms("slot_cylinder_"),
     )
