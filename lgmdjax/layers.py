@@ -47,8 +47,6 @@ class Rays(NamedTuple):
     d: Vector
     d_u: Vector
     d_v: Vector
-    level_square: Array
-    """d_x^2 + d_y^2."""
     slant: "_Slant"
     """Of upright edges."""
     across: Pair
@@ -76,14 +74,13 @@ class Layer(NamedTuple):
 
 def rays(d: Vector, d_u: Vector, d_v: Vector) -> Rays:
     """Complete rays given by their directions and how these change."""
-    level_square = d[0] * d[0] + d[1] * d[1] + 1e-12
     m_u, m_v = d[1] * d_u[0] - d[0] * d_u[1], d[1] * d_v[0] - d[0] * d_v[1]
     slant = _slant(m_u, m_v)
     inverse = slant.per_p
-    per_pixel = _once(jnp.sqrt(level_square)) * inverse
+    per_pixel = _once(jnp.sqrt(d[0] * d[0] + d[1] * d[1] + 1e-12)) * inverse
     across, (right_u, right_v) = (d[0] * per_pixel, d[1] * per_pixel), (m_u * inverse, m_v * inverse)
     turn = right_u * d_u[0] + right_v * d_v[0], right_u * d_u[1] + right_v * d_v[1]
-    return Rays(d, d_u, d_v, level_square, slant, across, (right_u, right_v), turn)
+    return Rays(d, d_u, d_v, slant, across, (right_u, right_v), turn)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
