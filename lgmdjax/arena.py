@@ -161,22 +161,23 @@ def is_overhead(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
 
 
 def nearest(
-    arena: Arena, position: Float[Array, "2"], boxes: int = 3, cylinders: int = 2
+    arena: Arena, starts: Float[Array, "s axes"], ends: Float[Array, "s axes"]
 ) -> tuple[Prisms, Prisms]:
-    """Pick what the physics must know of at (x, y): so many nearest boxes, walls among them, and cylinders.
+    """Pick what the physics must know of: for each plane segment the nearest box, walls among them, and cylinder.
 
-    The counts are static; where a room has fewer, the rest are parked. Gradient: through the prisms picked.
+    Both have an entry a segment. Where a room has none, or it hangs overhead, they are parked or overhead ones.
+    Gradient: through the prisms picked.
     """
+    p, q = starts[..., :2], ends[..., :2]
     solid = join(arena.boxes, walls(arena))
-    point = position[None]
     return (
-        _least(solid, _to_boxes(solid, point, point)[0], boxes),
-        _least(arena.cylinders, _to_cylinders(arena.cylinders, point, point)[0], cylinders),
+        _least(solid, _to_boxes(solid, p, q)),
+        _least(arena.cylinders, _to_cylinders(arena.cylinders, p, q)),
     )
 
 
-def _least(prisms: Prisms, distance: Array, count: int) -> Prisms:
-    chosen = jax.lax.top_k(-distance, count)[1]
+def _least(prisms: Prisms, distances: Float[Array, "s n"]) -> Prisms:
+    chosen = jnp.argmin(distances, axis=-1)
     return jax.tree.map(lambda leaf: leaf[chosen], prisms)
 
 

@@ -2,7 +2,8 @@
 
 `mjcf/hexapod.xml` is the home of every mass, length, limit and gain; this module turns its names into static
 indices and reads poses out of `mjx.Data`. The `mjx.Model` is an argument everywhere, so that robots in rooms
-of their own are a `vmap`: the physics has a few obstacle slots, which `place_obstacles` moves to the nearest.
+of their own are a `vmap`: the physics has a box and a cylinder for the trunk and for each leg, which
+`place_obstacles` moves to what is nearest. More would cost: in MJX every pair that may touch is computed in each step.
 
 | symbol  | name                                              | unit               |
 | ------- | ------------------------------------------------- | ------------------ |
@@ -31,6 +32,7 @@ from lgmdjax.errors import InputError
 
 LEGS = ("left_front", "left_middle", "left_rear", "right_rear", "right_middle", "right_front")
 JOINTS = ("coxa", "femur", "tibia")
+PARTS = ("trunk", *LEGS)  # what has obstacle slots of its own
 EYES = ("eye_left", "eye_right")
 LOWEST, HIGHEST = 0.04, 0.30  # m; where the trunk of a robot on its feet can be
 LEAST_UPRIGHT = 0.7  # cosine of the trunk's tilt; below it (45 degrees) the robot has fallen
@@ -53,8 +55,9 @@ class _Anatomy(NamedTuple):
     laser: np.ndarray  # (3,) m, in the trunk's frame
     capsules: np.ndarray  # (13,) geoms that collide with obstacles
     feet: np.ndarray  # (6,) geoms that stand on the floor
-    boxes: np.ndarray  # obstacle slots
-    cylinders: np.ndarray
+    boxes: np.ndarray  # (7,) obstacle slots, one for each of PARTS
+    cylinders: np.ndarray  # (7,)
+    reach: np.ndarray  # (2, 7, 3) m, both ends of PARTS in the trunk's frame: bumper, and hip to foot in stance
 
 
 def xml_path() -> Path:
@@ -111,24 +114,26 @@ def differentiable(model: mjx.Model, *, soft: bool = False) -> mjx.Model:
 @cache
 def _anatomy() -> _Anatomy:
     model = load()
-    names = [model.geom(i).name for i in range(model.ngeom)]
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("stance").id)
+    mujoco.mj_kinematics(model, data)
 
-    def numbers(ids: list[int]) -> np.ndarray:
+    def geoms(names: list[str]) -> np.ndarray:
         # Of 32 bits in either precision: JAX remembers of an array of 64 the precision in which it met it first.
-        return np.array(ids, dtype=np.int32)
+        return np.array([model.geom(name).id for name in names], dtype=np.int32)
 
-    def geoms(prefix: str) -> np.ndarray:
-        return numbers([i for i, name in enumerate(names) if name.startswith(prefix)])
-
-    limbs = [model.geom(f"{leg}_{part}").id for leg in LEGS for part in ("femur", "tibia")]
+    nose = model.geom("bumper").size[1] * np.array([1.0, 0.0, 0.0])
+    hips = [data.joint(f"{leg}_coxa").xanchor for leg in LEGS] - data.body("trunk").xpos
+    soles = [data.geom(f"{leg}_foot").xpos for leg in LEGS] - data.body("trunk").xpos
     return _Anatomy(
         stance=model.key("stance").qpos.copy(),
         eyes=np.stack([model.site(name).pos for name in EYES]),
         laser=model.site("laser").pos.copy(),
-        capsules=numbers([model.geom("bumper").id, *limbs]),
-        feet=numbers([model.geom(f"{leg}_foot").id for leg in LEGS]),
-        boxes=geoms("slot_box_"),
-        cylinders=geoms("slot_cylinder_"),
+        capsules=geoms(["bumper", *(f"{leg}_{part}" for leg in LEGS for part in ("femur", "tibia"))]),
+        feet=geoms([f"{leg}_foot" for leg in LEGS]),
+        boxes=geoms([f"slot_box_{part}" for part in PARTS]),
+        cylinders=geoms([f"slot_cylinder_{part}" for part in PARTS]),
+        reach=np.stack([[-nose, *hips], [nose, *soles]]),
     )
 
 
@@ -182,13 +187,14 @@ def substep(model: mjx.Model, data: mjx.Data, targets: Float[Array, "6 3"]) -> m
 
 
 def place_obstacles(model: mjx.Model, room: arena.Arena, pose: Pose) -> mjx.Model:
-    """Move the obstacle slots of the physics to the walls, boxes and cylinders nearest to the robot.
+    """Move the obstacle slots of trunk and legs to the box, walls among them, and the cylinder nearest to each.
 
-    A cylinder is a capsule whose caps reach beyond its ends: into the floor, and above the robot. What hangs
-    overhead is put aside.
+    Legs are taken as they stand, from hip to foot. A cylinder is a capsule whose caps reach beyond its ends: into the
+    floor, and above the robot. What hangs overhead is put aside.
     """
     slots = _anatomy()
-    boxes, cylinders = arena.nearest(room, pose.position[:2], len(slots.boxes), len(slots.cylinders))
+    starts, ends = pose.position + slots.reach.astype(pose.position.dtype) @ rotation(pose).T
+    boxes, cylinders = arena.nearest(room, starts, ends)
     ids = np.concatenate([slots.boxes, slots.cylinders])
     kept = ("centre", "half_size", "yaw", "bottom", "top")
     both = {name: jnp.concatenate([getattr(boxes, name), getattr(cylinders, name)]) for name in kept}

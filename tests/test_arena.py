@@ -25,7 +25,7 @@ clearance = jax.jit(arena.clearance)
 margins = jax.jit(arena.margins, static_argnames="ahead")
 random_rooms = jax.jit(jax.vmap(scenes.random_room, in_axes=(0, None)))
 free_poses = jax.jit(arena.free_poses, static_argnames="count")
-nearest = jax.jit(arena.nearest, static_argnames=("boxes", "cylinders"))
+nearest = jax.jit(arena.nearest)
 KEYS = jax.random.split(jax.random.key(0), 32)
 
 
@@ -162,32 +162,37 @@ def test_clearance_grows_as_fast_as_the_robot_backs_off() -> None:
 
 def test_nearest_knows_walls_and_leaves_out_what_hangs_overhead() -> None:
     room = scenes.indoor_scene()
-    boxes, cylinders = nearest(room, jnp.asarray([0.6, 1.2]))
-    # The table top would be the nearest; the box ahead, the wall at y = 3, then another wall or box.
-    np.testing.assert_allclose(boxes.centre[:2], [[1.4, 0.0], [0.0, 3.5]])
+    starts, ends = jnp.asarray([[0.6, 1.2], [0.6, 2.0]]), jnp.asarray([[0.7, 1.2], [0.6, 2.8]])
+    boxes, cylinders = nearest(room, starts, ends)
+    # The table's top would be the nearest to the first; the box ahead of it comes next. The second ends by the wall y = 3.
+    np.testing.assert_allclose(boxes.centre, [[1.4, 0.0], [0.0, 3.5]])
+    np.testing.assert_allclose(boxes.top, [0.6, float(room.wall_height)])
     np.testing.assert_allclose(cylinders.centre, [[0.4, 1.05], [0.4, 1.85]])
-    np.testing.assert_allclose(boxes.top[:2], [0.6, float(room.wall_height)])
 
 
-def test_nearest_holds_whatever_is_within_its_reach() -> None:
-    """What physics sees is as near as what the room has, wherever the robot stands."""
+def test_nearest_holds_what_each_segment_would_touch_first() -> None:
+    """What physics knows of is as near as what the room has, wherever the robot stands."""
     room = scenes.testing_room()
-    places = np.random.default_rng(2).uniform(-3.9, 3.9, (200, 2))
+    rng = np.random.default_rng(2)
+    starts = rng.uniform(-3.8, 3.8, (200, 2))
+    ends = starts + rng.uniform(-0.15, 0.15, (200, 2))
+    boxes, cylinders = nearest(room, jnp.asarray(starts), jnp.asarray(ends))
+    assert count(boxes) == count(cylinders) == 200
+    room, boxes, cylinders = jax.tree.map(np.asarray, (room, boxes, cylinders))
+    open_field = dataclasses.replace(room, room=np.array([-99.0, 99.0, -99.0, 99.0]))
+    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        line = reference.segment(start, end)
+        picked = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], prisms) for prisms in (boxes, cylinders)]
+        few = dataclasses.replace(open_field, boxes=picked[0], cylinders=picked[1])
+        there = reference.point_to_room(room, line).min()
+        # Of two that the segment cuts either will do.
+        known = reference.point_to_room(few, line).min()
+        assert known == pytest.approx(there, abs=1e-6) or max(known, there) < 0
 
-    def both(place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        boxes, cylinders = arena.nearest(room, place)
-        far = jnp.asarray([-1e4, 1e4, -1e4, 1e4])
-        few = dataclasses.replace(room, boxes=boxes, cylinders=cylinders, room=far)
-        point, radius = place[None], jnp.zeros(1)
-        return arena.clearance(few, point, point, radius), arena.clearance(room, point, point, radius)
 
-    seen, there = jax.jit(jax.vmap(both))(places)
-    np.testing.assert_allclose(seen, there, atol=1e-12)
-
-
-def test_nearest_pads_with_parked_prisms() -> None:
-    boxes, cylinders = nearest(arena.empty_room(), jnp.zeros(2), boxes=6, cylinders=2)
-    assert count(boxes) == 4
+def test_nearest_gives_a_parked_cylinder_where_there_is_none() -> None:
+    boxes, cylinders = nearest(arena.empty_room(), jnp.zeros((6, 2)), jnp.ones((6, 2)))
+    assert count(boxes) == 6
     assert count(cylinders) == 0
 
 

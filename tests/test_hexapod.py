@@ -1,5 +1,6 @@
 """The robot stands, walks against things and is stopped by them, and is the same robot in MJX and in C MuJoCo."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -226,14 +227,30 @@ def test_slots_are_where_the_room_has_things_and_nothing_hangs_in_the_way(model)
         cylinders=arena.place([[0.0, 0.4], [0.6, 0.0]], [[0.1], [0.5]], [0.4, 1.0], bottom=[0.0, 0.5], count=3),
     )
     placed = hexapod.place_obstacles(model, scene, hexapod.Pose(position=jnp.zeros(3), quaternion=jnp.eye(4)[0]))
-    box = mujoco_id("slot_box_0")
-    np.testing.assert_allclose(placed.geom_pos[box], [1.0, 0.5, 0.2], atol=1e-9)
-    np.testing.assert_allclose(placed.geom_size[box], [0.3, 0.2, 0.2], atol=1e-9)
-    np.testing.assert_allclose(placed.geom_quat[box], [np.cos(0.2), 0, 0, np.sin(0.2)], atol=1e-9)
-    first, second = mujoco_id("slot_cylinder_0"), mujoco_id("slot_cylinder_1")
-    np.testing.assert_allclose(placed.geom_pos[first], [0.0, 0.4, 0.2], atol=1e-9)
-    np.testing.assert_allclose(placed.geom_size[first, :2], [0.1, 0.2], atol=1e-9)
-    assert abs(placed.geom_pos[second, 2]) > 10 or abs(placed.geom_pos[second, 0]) > 10
+    for box in map(mujoco_id, ("slot_box_trunk", "slot_box_left_front")):
+        np.testing.assert_allclose(placed.geom_pos[box], [1.0, 0.5, 0.2], atol=1e-9)
+        np.testing.assert_allclose(placed.geom_size[box], [0.3, 0.2, 0.2], atol=1e-9)
+        np.testing.assert_allclose(placed.geom_quat[box], [np.cos(0.2), 0, 0, np.sin(0.2)], atol=1e-9)
+    for cylinder in map(mujoco_id, ("slot_cylinder_trunk", "slot_cylinder_left_middle")):
+        np.testing.assert_allclose(placed.geom_pos[cylinder], [0.0, 0.4, 0.2], atol=1e-9)
+        np.testing.assert_allclose(placed.geom_size[cylinder, :2], [0.1, 0.2], atol=1e-9)
+    heights = placed.geom_pos[[i for i in range(placed.ngeom) if geom_name(i).startswith("slot")], 2]
+    assert np.all((np.abs(heights - 0.2) < 0.8) | (heights > 10))
+
+
+def test_each_part_knows_its_own_nearest(model):
+    """A room with a thing at the left front leg and another at the right rear one; the trunk between two."""
+    things = cylinders(((0.30, 0.25), 0.05), ((-0.28, -0.25), 0.05), ((0.0, 0.45), 0.05))
+    pose = hexapod.Pose(position=jnp.asarray([0.5, 0.5, 0.1]), quaternion=jnp.asarray([0.0, 0.0, 0.0, 1.0]))
+    moved = replace(things, centre=0.5 - things.centre)  # about a robot that looks back
+    placed = hexapod.place_obstacles(model, room(cylinders=moved), pose)
+    for part, thing in {"left_front": 0, "right_rear": 1, "left_middle": 2}.items():
+        where = placed.geom_pos[mujoco_id(f"slot_cylinder_{part}"), :2]
+        np.testing.assert_allclose(where, moved.centre[thing], atol=1e-9, err_msg=part)
+
+
+def geom_name(index: int) -> str:
+    return hexapod.load().geom(index).name
 
 
 def mujoco_id(name: str) -> int:
