@@ -160,9 +160,7 @@ def is_overhead(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
     return prisms.bottom >= ROBOT_HEIGHT
 
 
-def nearest(
-    arena: Arena, starts: Float[Array, "s axes"], ends: Float[Array, "s axes"]
-) -> tuple[Prisms, Prisms]:
+def nearest(arena: Arena, starts: Float[Array, "s axes"], ends: Float[Array, "s axes"]) -> tuple[Prisms, Prisms]:
     """Pick what the physics must know of: for each plane segment the nearest box, walls among them, and cylinder.
 
     Both have an entry a segment. Where a room has none, or it hangs overhead, they are parked or overhead ones.
@@ -188,9 +186,7 @@ def walls(arena: Arena, thickness: float = 1.0) -> Prisms:
     length, width = 0.5 * (x_max - x_min) + thickness, 0.5 * (y_max - y_min) + thickness
     centre = [[x_min - half, y], [x_max + half, y], [x, y_min - half], [x, y_max + half]]
     half_size = [[half, width], [half, width], [length, half], [length, half]]
-    boxes = place(
-        jnp.asarray(centre), jnp.asarray(half_size), arena.wall_height, texture=arena.wall_texture, count=4
-    )
+    boxes = place(jnp.asarray(centre), jnp.asarray(half_size), arena.wall_height, texture=arena.wall_texture, count=4)
     return jax.tree.map(lambda leaf: leaf.astype(arena.room.dtype), boxes)
 
 

@@ -142,9 +142,7 @@ def check(params: Params) -> None:
     """Raise `InputError` if a number is not finite, or the range or the distances are the wrong way round."""
     for name, value in vars(params).items():
         if not math.isfinite(value):
-            raise InputError(
-                f"braitenberg {name}: expected a finite number, got {value}; see braitenberg.Params"
-            )
+            raise InputError(f"braitenberg {name}: expected a finite number, got {value}; see braitenberg.Params")
     for name in ("base", "gain_2a", "gain_3b", "close", "full_turn", "symmetry", "steady"):
         if getattr(params, name) < 0:
             raise InputError(f"braitenberg {name}: expected a number >= 0, got {getattr(params, name)}")

@@ -34,7 +34,7 @@ from flax import struct
 from jaxtyping import Array, Float
 from scipy import ndimage
 
-from lgmdjax import arena, camera, episodes, lgmd
+from lgmdjax import arena, camera, lgmd, redraw, rollout
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE, Record
 
@@ -84,16 +84,16 @@ def survey(
 
     def walk(room: arena.Arena, poses: tuple[Array, Array, Array]):
         def frame(state: lgmd.State, pose: tuple[Array, Array, Array]):
-            pictures = episodes.picture(eyes, room, *pose)
+            pictures = redraw.frame(eyes, room, *pose)
             state, u, FF = jax.vmap(see_all, in_axes=(None, 0, 0))(candidates, state, pictures)
             return state, (u, FF)
 
-        first = episodes.picture(eyes, room, *(leaf[0] for leaf in poses))
+        first = redraw.frame(eyes, room, *(leaf[0] for leaf in poses))
         opened = jax.vmap(lgmd.init, in_axes=(None, 0))(params, first)
         return jax.lax.scan(frame, opened, poses)[1]
 
     poses = (record.time, record.position, record.quaternion)
-    return jax.vmap(walk)(arenas, jax.tree.map(jnp.asarray, poses))
+    return rollout.deal(walk, arenas, jax.tree.map(jnp.asarray, poses))
 
 
 def choose(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: Candidates) -> Choice:
@@ -122,9 +122,7 @@ def choose(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: 
     ]
     best = max(table, key=lambda row: row["score"])
     suppression = MARGIN * float(np.max(np.asarray(feed_forward)[sound]))
-    return Choice(
-        threshold=best["threshold"], inhibition=best["inhibition"], suppression=suppression, table=table
-    )
+    return Choice(threshold=best["threshold"], inhibition=best["inhibition"], suppression=suppression, table=table)
 
 
 def _sound(record: Record) -> np.ndarray:

@@ -65,9 +65,7 @@ class Checkpoints:
             self.manager.save(step, args=args)
             self.manager.wait_until_finished()
         except OSError as error:
-            raise InputError(
-                f"{self.folder}: expected to write, got {_line(error)}; free some disk"
-            ) from error
+            raise InputError(f"{self.folder}: expected to write, got {_line(error)}; free some disk") from error
 
     def close(self) -> None:
         """Let go of the folder."""

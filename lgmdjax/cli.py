@@ -160,10 +160,11 @@ def _execute(pipeline: Pipeline, target: str) -> Path:
 
 
 def _prepare_jax() -> None:
-    """Set what JAX reads on import, where the user has not: compiled programs are kept, and less noise."""
+    """Set what JAX reads on import, where the user has not: programs are kept, robots go to all cores, less noise."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(len(os.sched_getaffinity(0))))
     # XLA reports its own tuning flags as errors whenever it reads a compiled program back; real ones raise.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 

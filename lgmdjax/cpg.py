@@ -91,9 +91,7 @@ def settled(params: Params) -> State:
     waveform has a transient. A symmetric start would not do: all legs in step is a solution as well, though
     an unstable one.
     """
-    u, v = (
-        _in_antiphase(even) * jnp.asarray(params.tonic) for even in (SETTLED_ACTIVATION, SETTLED_ADAPTATION)
-    )
+    u, v = (_in_antiphase(even) * jnp.asarray(params.tonic) for even in (SETTLED_ACTIVATION, SETTLED_ADAPTATION))
     return State(activation=u, adaptation=v)
 
 
@@ -105,9 +103,7 @@ def init(params: Params, key: Array | None = None) -> State:
     return State(activation=start[0], adaptation=start[1])
 
 
-def step(
-    params: Params, state: State, interval: Float[Array, ""] | float
-) -> tuple[State, Float[Array, "6 2"]]:
+def step(params: Params, state: State, interval: Float[Array, ""] | float) -> tuple[State, Float[Array, "6 2"]]:
     """Advance the network by `interval` seconds with RK4 (eqs. 1-5); return its state and the rhythm there.
 
     The rectifier bends each neuron's course wherever its activation crosses zero, so over whole cycles RK4 is
@@ -152,9 +148,7 @@ def phases(outputs: Float[np.ndarray, "steps 6"], interval: float, cycle: float)
         interval: time between steps.
         cycle: length of a cycle, in the unit of `interval`.
     """
-    last = np.array(
-        [(_rises(x) * interval)[-1:].sum() if _rises(x).size else np.nan for x in np.asarray(outputs).T]
-    )
+    last = np.array([(_rises(x) * interval)[-1:].sum() if _rises(x).size else np.nan for x in np.asarray(outputs).T])
     return ((last - last[0]) / cycle) % 1.0
 
 
@@ -173,9 +167,7 @@ def first_rise(output: Float[np.ndarray, "steps"], interval: float) -> float:
 def check(params: Params) -> None:
     """Raise `InputError` if a constant is not finite, not positive, or of another number of legs."""
     if jnp.shape(params.coupling) != (LEGS, LEGS):
-        raise InputError(
-            f"cpg coupling: expected shape (6, 6), got {jnp.shape(params.coupling)}; give a row a leg"
-        )
+        raise InputError(f"cpg coupling: expected shape (6, 6), got {jnp.shape(params.coupling)}; give a row a leg")
     for name in ("reaction_time", "adaptation_time", "cycle_time", "natural_period"):
         if not (value := float(getattr(params, name))) > 0 or not math.isfinite(value):
             raise InputError(f"cpg {name}: expected a positive finite number, got {value}; see cpg.Params")

@@ -147,18 +147,14 @@ def video_codec() -> Finding:
     with av.open(file, "r") as container:
         stream = container.streams.video[0]
         codec, found = stream.codec_context.name, sum(1 for _ in container.decode(stream))
-    return Finding(
-        OK if found == FRAMES else FAIL, f"{codec}: {found} of {FRAMES} frames came back from H.264"
-    )
+    return Finding(OK if found == FRAMES else FAIL, f"{codec}: {found} of {FRAMES} frames came back from H.264")
 
 
 def disk(out: Path) -> Finding:
     """Look for room for a run."""
     free = shutil.disk_usage(_nearest(out)).free / 1e9
     level = OK if free >= ENOUGH_GB else WARN if free >= LEAST_GB else FAIL
-    return Finding(
-        level, f"{free:.1f} GB free for {out}" + ("" if level == OK else f"; {ENOUGH_GB:g} GB are enough")
-    )
+    return Finding(level, f"{free:.1f} GB free for {out}" + ("" if level == OK else f"; {ENOUGH_GB:g} GB are enough"))
 
 
 def folder(out: Path) -> Finding:
@@ -168,9 +164,7 @@ def folder(out: Path) -> Finding:
         with tempfile.TemporaryFile(dir=place):
             return Finding(OK, f"{place.resolve()} can be written")
     except OSError as error:
-        return Finding(
-            FAIL, f"expected a folder that can be written, got {place} ({error.strerror}); choose --out"
-        )
+        return Finding(FAIL, f"expected a folder that can be written, got {place} ({error.strerror}); choose --out")
 
 
 def _nearest(path: Path) -> Path:

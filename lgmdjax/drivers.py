@@ -112,9 +112,7 @@ def _init_anyone(params: Anyone, key: Array) -> tuple[Any, ...]:
 
 
 def _step_anyone(params: Anyone, states: tuple[Any, ...], senses: Senses):
-    results = [
-        driver.step(own, state, senses) for driver, own, state in zip(ALL, params.drivers, states, strict=True)
-    ]
+    results = [driver.step(own, state, senses) for driver, own, state in zip(ALL, params.drivers, states, strict=True)]
     velocities = jnp.stack([velocity for _, velocity in results])
     return tuple(state for state, _ in results), jnp.take(velocities, params.seat, axis=0)
 

@@ -13,8 +13,8 @@
 | clearance, contact            | m, -     | least clearance within the frame, and whether it was none   |
 | fresh, setbacks, ok           | -        | just put down, how often so far, sound                      |
 
-Pictures are not stored: `redraw` draws them again from the poses. A walk is written in chunks, each a file that
-is complete before it gets its name, so that a kill at any moment loses the running chunk at most. Numbers
+Pictures are not stored: `lgmdjax.redraw` draws them again from the poses. A walk is written in chunks, each a file
+that is complete before it gets its name, so that a kill at any moment loses the running chunk at most. Numbers
 keep the precision in which they came.
 
 Source: Cizek & Faigl, sec. 4.2 and 5.1: the training data are stretches of collision-free walking.
@@ -24,21 +24,18 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from lgmdjax import arena, camera, hexapod
 from lgmdjax.errors import InputError
-from lgmdjax.simulation import Leaf, Record
+from lgmdjax.simulation import Record
 
 FORMAT, VERSION = "lgmdjax episodes", 1
 SIDES = ("left", "right")
@@ -122,9 +119,7 @@ class Writer:
             for abandoned in self.folder.glob("*.part"):
                 abandoned.unlink()
         except OSError as error:
-            raise InputError(
-                f"{folder}: expected a folder to write to, got {error}; choose another"
-            ) from error
+            raise InputError(f"{folder}: expected a folder to write to, got {error}; choose another") from error
         self.chunks = len(_files(self.folder)) and len(_tables(self.folder, self.parameters))
 
     def write(self, record: Any, *, episode: int, rooms: Sequence[int], seed: int) -> Path:
@@ -168,15 +163,11 @@ def read(folder: Path | str, parameters: Mapping[str, Any] | None = None) -> lis
     """
     tables = _tables(Path(folder), parameters)
     if not tables:
-        raise InputError(
-            f"{folder}: expected recorded walks, got no chunk-*.parquet; `lgmdjax collect` makes some"
-        )
+        raise InputError(f"{folder}: expected recorded walks, got no chunk-*.parquet; `lgmdjax collect` makes some")
     try:
         table = pa.concat_tables(tables)
     except pa.ArrowException as error:
-        raise InputError(
-            f"{folder}: expected chunks of one precision, got mixed ones; collect again"
-        ) from error
+        raise InputError(f"{folder}: expected chunks of one precision, got mixed ones; collect again") from error
     columns = {name: table[name].to_numpy() for name in COLUMNS}
     # Stable, so that the frames of a walk stay in the order of the chunks.
     order = np.lexsort((columns["robot"], columns["episode"]))
@@ -196,42 +187,6 @@ def batched(walks: Sequence[Walk]) -> Record:
     return Record(**{name: np.stack([getattr(walk, name) for walk in walks]) for name in FIELDS})
 
 
-def redraw(
-    eyes: camera.Params, rooms: arena.Arena, record: Record
-) -> Float[np.ndarray, "robots frames 2 height columns"]:
-    """Draw what the eyes of a crowd saw once more, grey levels 0..255: bit for bit on the machine where it walked.
-
-    One program draws every frame, so that any part of a walk gives the same bits. They are those of the walk if the
-    whole crowd is drawn, since the compiler may round a crowd of another size otherwise, by less than 0.001 grey
-    levels in single precision.
-
-    Args:
-        rooms: a room a robot; things that move are put where they were.
-        record: axes (robot, frame), as `batched` gives it.
-    """
-    poses = (np.asarray(leaf) for leaf in (record.time, record.position, record.quaternion))
-    frames = zip(*(leaf.swapaxes(0, 1) for leaf in poses), strict=True)
-    return np.stack([_pictures(eyes, rooms, *frame) for frame in frames], axis=1)
-
-
-@partial(jax.jit, static_argnames="eyes")
-def _pictures(eyes: camera.Params, rooms: arena.Arena, *poses: Leaf) -> Float[Array, "robots 2 height columns"]:
-    return jax.vmap(partial(picture, eyes))(rooms, *poses)
-
-
-@partial(jax.jit, static_argnames="eyes")
-def picture(
-    eyes: camera.Params,
-    room: arena.Arena,
-    time: Float[Array, ""],
-    position: Float[Array, "3"],
-    quaternion: Float[Array, "4"],
-) -> Float[Array, "2 height columns"]:
-    """Draw what both eyes see from a pose of the trunk [m, 1], at a time [s] that tells where moving things are."""
-    pose = hexapod.Pose(position=position, quaternion=quaternion)
-    return camera.render(eyes, arena.at(room, time), *hexapod.eye_poses(pose))
-
-
 def stretches(walks: Sequence[Walk], minimum: int = 90, settle: int = 2) -> list[Walk]:
     """Cut walks into stretches of sound, collision-free, uninterrupted walking.
 
@@ -240,9 +195,7 @@ def stretches(walks: Sequence[Walk], minimum: int = 90, settle: int = 2) -> list
         minimum: frames that a stretch must have.
         settle: frames dropped after the robot was put down: the eyes first need two pictures to compare.
     """
-    return [
-        stretch for walk in walks for stretch in _stretches(walk, settle) if len(stretch) >= max(minimum, 1)
-    ]
+    return [stretch for walk in walks for stretch in _stretches(walk, settle) if len(stretch) >= max(minimum, 1)]
 
 
 def _stretches(walk: Walk, settle: int) -> Iterator[Walk]:
@@ -305,15 +258,12 @@ def _tables(folder: Path, parameters: Mapping[str, Any] | None) -> list[pa.Table
     expected = None if parameters is None else json.loads(json.dumps(dict(parameters)))
     for number, path in enumerate(_files(folder)):
         if path.name != f"chunk-{number:05d}.parquet":
-            raise InputError(
-                f"{folder}: expected chunk-{number:05d}.parquet, got {path.name}; a chunk is missing"
-            )
+            raise InputError(f"{folder}: expected chunk-{number:05d}.parquet, got {path.name}; a chunk is missing")
         found = _header(path)["parameters"]
         expected = found if expected is None else expected
         if found != expected:
             raise InputError(
-                f"{path}: expected walks of the same settings, got {_differences(expected, found)}; "
-                "use another folder"
+                f"{path}: expected walks of the same settings, got {_differences(expected, found)}; use another folder"
             )
         tables.append(_read(path))
     return tables

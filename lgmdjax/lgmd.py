@@ -127,9 +127,7 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
     return Layers(difference=P, excitation=E, inhibition=I, summation=E - jnp.abs(I) * params.inhibition)
 
 
-def inhibit(
-    kernel: Float[Array, "5 5"], difference: Float[Array, "height width"]
-) -> Float[Array, "height width"]:
+def inhibit(kernel: Float[Array, "5 5"], difference: Float[Array, "height width"]) -> Float[Array, "height width"]:
     """Spread the last change over the neighbours (eq. 8), zero beyond the border.
 
     The kernel is taken as the mean of its four mirror images, so that left and right eye stay mirror images
@@ -174,9 +172,7 @@ def hemifield(picture: Array | np.ndarray, side: int, overlap: float) -> Array |
         overlap: fraction of the width that an eye keeps; 0.5 is no overlap, 1 the whole picture.
     """
     if not 0.5 <= overlap <= 1:
-        raise InputError(
-            f"lgmd overlap: expected a fraction of the width in 0.5..1, got {overlap}; 0.5 is no overlap"
-        )
+        raise InputError(f"lgmd overlap: expected a fraction of the width in 0.5..1, got {overlap}; 0.5 is no overlap")
     if side not in (LEFT, RIGHT):
         raise InputError(f"lgmd side: expected 0 (left) or 1 (right), got {side}; see lgmd.LEFT, lgmd.RIGHT")
     width = jnp.shape(picture)[-1]
@@ -199,9 +195,7 @@ def check(params: Params) -> None:
     if w.shape != (2 * REACH + 1, 2 * REACH + 1):
         raise InputError(f"lgmd kernel: expected shape (5, 5), got {w.shape}; eq. 9 is lgmd.KERNEL")
     if not (np.allclose(w, w[::-1]) and np.allclose(w, w[:, ::-1])):
-        raise InputError(
-            "lgmd kernel: expected its own mirror image, got other weights on one side; average them"
-        )
+        raise InputError("lgmd kernel: expected its own mirror image, got other weights on one side; average them")
 
 
 def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:

@@ -72,9 +72,7 @@ class State:
 
 class _Recurrent(nnx.Module):
     def __init__(self, inputs: int, units: int, rngs: nnx.Rngs):
-        self.cell = nnx.OptimizedLSTMCell(
-            inputs, units, kernel_init=jax.nn.initializers.glorot_uniform(), rngs=rngs
-        )
+        self.cell = nnx.OptimizedLSTMCell(inputs, units, kernel_init=jax.nn.initializers.glorot_uniform(), rngs=rngs)
         self.head = nnx.Linear(units, 2, kernel_init=jax.nn.initializers.glorot_uniform(), rngs=rngs)
 
     def __call__(self, carry: tuple[Array, Array], inputs: Array) -> tuple[tuple[Array, Array], Array]:
@@ -166,14 +164,10 @@ def load(path: Path | str) -> tuple[Params, dict[str, Any]]:
             if header.get("version") != VERSION:
                 raise InputError(f"{path}: expected version {VERSION}, got {header.get('version')}; {again}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        metadata = {
-            name: json.loads(text) for name, text in header.items() if name not in ("format", "version")
-        }
+        metadata = {name: json.loads(text) for name, text in header.items() if name not in ("format", "version")}
         template = jax.eval_shape(lambda: create(jax.random.key(0), metadata["variant"], metadata["units"]))
     except (OSError, SafetensorError, json.JSONDecodeError, KeyError) as error:
-        raise InputError(
-            f"{path}: expected a safetensors file of a navigator, got {error}; {again}"
-        ) from error
+        raise InputError(f"{path}: expected a safetensors file of a navigator, got {error}; {again}") from error
     expected = {name: value.shape for name, value in _tensors(template).items()}
     found = {name: value.shape for name, value in tensors.items()}
     if found != expected:

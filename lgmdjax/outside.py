@@ -117,9 +117,7 @@ def directions(
     return rotation[:, 0] - across[None, :, None] * rotation[:, 1] - down[:, None, None] * rotation[:, 2]
 
 
-def _cast_room(
-    params: Params, arena: Arena, eye: Array, rotation: Array, target: Array
-) -> tuple[_Surface, Array]:
+def _cast_room(params: Params, arena: Arena, eye: Array, rotation: Array, target: Array) -> tuple[_Surface, Array]:
     """Cast the room: its solid surface, and how opaque the nearest glass before it is (0: none)."""
     d = directions(params, rotation)
     boxes, cylinders = arena.boxes.yaw.shape[0], arena.cylinders.yaw.shape[0]
@@ -155,16 +153,12 @@ def _opacity(arena: Arena, eye: Array, target: Array) -> Array:
     """How solid each prism is drawn: 1, but less near the line from the eye to the robot."""
     # The line ends short of the robot: what stands beside or before it hides nothing.
     line = eye[None, :2], (eye + CLEAR * (target - eye))[None, :2]
-    near = jnp.concatenate(
-        [distance_to_boxes(arena.boxes, *line)[0], distance_to_cylinders(arena.cylinders, *line)[0]]
-    )
+    near = jnp.concatenate([distance_to_boxes(arena.boxes, *line)[0], distance_to_cylinders(arena.cylinders, *line)[0]])
     share = jnp.clip((near - GLASS_TO) / (GLASS_FROM - GLASS_TO), 0.0, 1.0)
     return GLASS + (1 - GLASS) * share
 
 
-def _shade(
-    params: Params, arena: Arena, eye: Array, rotation: Array, d: Array, depth: Array, which: Array
-) -> _Surface:
+def _shade(params: Params, arena: Arena, eye: Array, rotation: Array, d: Array, depth: Array, which: Array) -> _Surface:
     """Colour what the rays hit."""
     hit = jnp.isfinite(depth)
     depth = jnp.where(hit, depth, _NOTHING)
@@ -221,9 +215,7 @@ def _prism_normal(local: Array, half: Array, z: Array, bottom: Array, top: Array
     side_y = jnp.stack([zero, jnp.sign(local[..., 1])], axis=-1)
     side = jnp.where(box[..., None], jnp.where(along_x, side_x, side_y), local / radius[..., None])
     lid = jnp.where(jnp.abs(z - top) < jnp.abs(z - bottom), 1.0, -1.0)
-    return jnp.concatenate(
-        [jnp.where(on_lid[..., None], 0.0, side), jnp.where(on_lid, lid, 0.0)[..., None]], axis=-1
-    )
+    return jnp.concatenate([jnp.where(on_lid[..., None], 0.0, side), jnp.where(on_lid, lid, 0.0)[..., None]], axis=-1)
 
 
 def _moved(step: Array, d: Array, normal: Array, depth: Array) -> Array:

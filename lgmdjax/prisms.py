@@ -134,9 +134,7 @@ def mirrored(prisms: Prisms) -> Prisms:
     return dataclasses.replace(prisms, centre=prisms.centre * flip, goal=prisms.goal * flip, yaw=-prisms.yaw)
 
 
-def distance_to_boxes(
-    boxes: Prisms, starts: Float[Array, "s 2"], ends: Float[Array, "s 2"]
-) -> Float[Array, "s n"]:
+def distance_to_boxes(boxes: Prisms, starts: Float[Array, "s 2"], ends: Float[Array, "s 2"]) -> Float[Array, "s n"]:
     """Measure the signed distance [m] of plane segments to boxes' footprints, negative where they overlap.
 
     Depth is the shortest shift that parts them. A segment may be a point.

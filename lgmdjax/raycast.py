@@ -26,9 +26,7 @@ _TINY = 1.0e-7
 """Direction components below this count as this: an axis-parallel ray then meets a face 1e7 lengths away."""
 
 
-def distance(
-    arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]
-) -> Float[Array, "*rays"]:
+def distance(arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays"]:
     """Measure how far rays go to floor, walls or obstacles: t in lengths of d, inf where nothing is.
 
     Hard: no footprint, no blending. Gradient: that of the surface hit; zero where nothing is.
@@ -48,9 +46,7 @@ def to_floor(origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]) -> 
     return jnp.where(falls & (t >= 0), t, jnp.inf)
 
 
-def to_walls(
-    arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]
-) -> Float[Array, "*rays"]:
+def to_walls(arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays"]:
     """Measure t to the walls' inner faces: where the ray leaves the room, if below the walls' tops."""
     x_min, x_max, y_min, y_max = arena.room
     x_in, x_out = _slab(origin[0], directions[..., 0], x_min, x_max)
@@ -61,9 +57,7 @@ def to_walls(
     return jnp.where(hit, t_out, jnp.inf)
 
 
-def to_boxes(
-    boxes: Prisms, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]
-) -> Float[Array, "*rays n"]:
+def to_boxes(boxes: Prisms, origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays n"]:
     """Measure t to every box, inf where it is missed."""
     return jnp.moveaxis(_to_boxes(boxes, origin, jnp.moveaxis(directions, -1, 0)), 0, -1)
 

@@ -1,15 +1,20 @@
 """Many frames, many robots: the one place that scans, maps and jits a walk.
 
-`walk` is a `lax.scan` of `simulation.step`; `Crowd` runs it for a batch of rooms in chunks of a few seconds of
-robot time, so that a host can show progress, write what came, and be interrupted between two chunks.
+`walk` is a `lax.scan` of `simulation.step`, `advance` runs it for a batch of rooms, and `chunks` does so for a few
+seconds of robot time at once, that a host can show progress, write what came, and be interrupted between two.
+
+The robots of a batch are dealt out to the devices. A core of a CPU is one if `JAX_NUM_CPU_DEVICES` says so before JAX
+starts, as the command line does: a body is many small sums in a row, which cores cannot share, but robots are apart.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
@@ -39,7 +44,7 @@ def walk(
 @partial(jax.jit, static_argnames="driver")
 def start(params: Params, model: mjx.Model, rooms: Room, *, driver: Driver) -> State:
     """Put one robot into each room of a batch."""
-    return jax.vmap(lambda room: simulation.init(params, model, room, driver))(rooms)
+    return deal(lambda room: simulation.init(params, model, room, driver), rooms)
 
 
 @partial(jax.jit, static_argnames=("driver", "frames"), donate_argnames="states")
@@ -54,8 +59,20 @@ def advance(
     draw: Bool[Array, ""] | bool,
 ) -> tuple[State, Record]:
     """Walk a batch of robots, each in its own room; the record's axes are (robot, frame)."""
-    one = lambda room, state: walk(params, model, room, state, driver, frames, draw)  # noqa: E731
-    return jax.vmap(one)(rooms, states)
+    return deal(lambda room, state: walk(params, model, room, state, driver, frames, draw), rooms, states)
+
+
+def deal(one: Callable[..., Any], *batches: Any) -> Any:
+    """Map a function of one robot over batches of robots, dealt out to as many devices as share them evenly.
+
+    Each gets two or more, since a batch of one is compiled differently, and comes to other last bits.
+    """
+    robots = jax.tree.leaves(batches)[0].shape[0]
+    counts = [n for n in range(1, jax.local_device_count() + 1) if robots % n == 0 and robots > n]
+    count = max(counts, default=1)
+    mesh, each = Mesh(np.asarray(jax.local_devices()[:count]), ("robots",)), PartitionSpec("robots")
+    # Unchecked: nothing passes between robots, and MJX starts its loops with constants, which the check refuses.
+    return jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
 
 
 def chunks(

@@ -111,9 +111,7 @@ def outdoor_scene(key: Array | None = None, *, contrast: ArrayLike = 1.0) -> Are
     return faded(dataclasses.replace(textured(arena, key), floor_texture=grass, sky=sky), contrast)
 
 
-def dynamic_scene(
-    key: Array | None = None, *, departs: ArrayLike = (10.0, 24.0), contrast: ArrayLike = 1.0
-) -> Arena:
+def dynamic_scene(key: Array | None = None, *, departs: ArrayLike = (10.0, 24.0), contrast: ArrayLike = 1.0) -> Arena:
     """Build the third scene of sec. 5.3: boxes are put in the way from the left, then from the right.
 
     Each takes 2 s from its `departs` [s]. Walking straight at v = 1.2, the robot has 0.6 m left to the first.

@@ -48,9 +48,7 @@ class Params:
     b1: Float[Array, "6 6"]
     w2: Float[Array, "6 6 3"]
     b2: Float[Array, "6 3"]
-    literal: bool = struct.field(
-        pytree_node=False, default=False
-    )  # the paper's input: no adaptation difference
+    literal: bool = struct.field(pytree_node=False, default=False)  # the paper's input: no adaptation difference
 
 
 def init(key: Array, *, literal: bool = False) -> Params:
@@ -110,9 +108,7 @@ def load(path: Path | str) -> Params:
                 raise InputError(f"{path}: expected version {VERSION}, got {header.get('version')}; {again}")
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except (OSError, SafetensorError) as error:
-        raise InputError(
-            f"{path}: expected safetensors with shaping networks, got {error}; {again}"
-        ) from error
+        raise InputError(f"{path}: expected safetensors with shaping networks, got {error}; {again}") from error
     found = {name: weight.shape for name, weight in weights.items()}
     if found != SHAPES:
         raise InputError(f"{path}: expected weights {SHAPES}, got {found}; {again}")
@@ -127,9 +123,7 @@ def metadata(path: Path | str) -> dict[str, object]:
     load(path)
     with safe_open(path, framework="numpy") as file:
         header = dict(file.metadata())
-    return {
-        name: value if name in ("format", "version") else json.loads(value) for name, value in header.items()
-    }
+    return {name: value if name in ("format", "version") else json.loads(value) for name, value in header.items()}
 
 
 def taught() -> Params:

@@ -140,7 +140,7 @@ def sense(
 
     # One program for both, which takes half a minute to compile; the choice is the same for a whole crowd. Only the
     # drawing is in it, since XLA would else draw anew inside each of the loops that read the picture, each time with
-    # other last bits; `episodes.redraw` gives the same ones.
+    # other last bits; `redraw.walks` gives the same ones.
     frames = jax.lax.cond(
         draw,
         lambda: camera.render(params.camera, scene, *hexapod.eye_poses(pose)),
@@ -162,9 +162,7 @@ def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tupl
     return replace(state, controller=nerves, teacher=teacher), label
 
 
-def move(
-    params: Params, model: mjx.Model, scene: arena.Arena, state: State
-) -> tuple[State, Float[Array, ""]]:
+def move(params: Params, model: mjx.Model, scene: arena.Arena, state: State) -> tuple[State, Float[Array, ""]]:
     """Run rhythm, servos and body to the next frame; return the least clearance [m] on the way."""
     model = hexapod.place_obstacles(model, scene, hexapod.pose(state.data))
     interval = 1 / (FRAME_RATE * SUBSTEPS)

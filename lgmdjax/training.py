@@ -219,9 +219,7 @@ def score(params: navigator.Params, walks: Sequence[Walk]) -> dict[str, Any]:
     }
 
 
-def table(
-    fitted: Mapping[str, navigator.Params], walks: Mapping[str, Sequence[Walk]]
-) -> list[dict[str, Any]]:
+def table(fitted: Mapping[str, navigator.Params], walks: Mapping[str, Sequence[Walk]]) -> list[dict[str, Any]]:
     """Score every navigator on every set of walks: a row each, columns like `test_mse`, `unseen_r2`."""
     rows = []
     for variant, params in fitted.items():
@@ -244,9 +242,7 @@ def _advance(
     return jax.lax.fori_loop(0, epochs, lambda _, p: _epoch(params, p, train, test, settings), progress)
 
 
-def _epoch(
-    params: navigator.Params, progress: Progress, train: Tape, test: Tape, settings: Settings
-) -> Progress:
+def _epoch(params: navigator.Params, progress: Progress, train: Tape, test: Tape, settings: Settings) -> Progress:
     optimiser = _optimiser(settings, len(train.u))
 
     def window(carry: tuple[Any, Any, navigator.State], tape: Tape):

@@ -101,7 +101,7 @@ def gauge(course: Course, cycle_time: float) -> Gauge:
     """Measure speed, turning and sway of a walk, over whole gait cycles after it settled."""
     first, cycle = round(SETTLING / STEP), cycle_time / STEP
     last = first + round(int((len(course.position) - 1 - first) / cycle) * cycle)
-    roll, pitch, yaw = (np.unwrap(angle)[first:last + 1] for angle in _angles(course.quaternion))
+    roll, pitch, yaw = (np.unwrap(angle)[first : last + 1] for angle in _angles(course.quaternion))
     seconds = (last - first) * STEP
     start, end = course.position[first, :2], course.position[last, :2]
     along = np.array([np.cos(yaw).mean(), np.sin(yaw).mean()])

@@ -112,9 +112,7 @@ def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Itera
         ) from error
     declared = _declared_seconds(container, stream)
     if declared - end > (1 + LOST_FRAMES) / _rate(stream):
-        raise InputError(
-            f"expected {declared:.2f} s of video, as {path} declares, got {end:.2f} s; get the whole file"
-        )
+        raise InputError(f"expected {declared:.2f} s of video, as {path} declares, got {end:.2f} s; get the whole file")
 
 
 def _declared_seconds(container: InputContainer, stream: VideoStream) -> float:

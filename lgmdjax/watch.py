@@ -71,8 +71,7 @@ def watch(
             course, excitations = _look_at_all(frames, sheet, folder / "overlay.mp4", film.rate, eyes, params)
             if len(course) < LEAST_FRAMES:
                 raise InputError(
-                    f"expected a video of {LEAST_FRAMES} frames or more, got {len(course)} in {path}; "
-                    "take a longer one"
+                    f"expected a video of {LEAST_FRAMES} frames or more, got {len(course)} in {path}; take a longer one"
                 )
             responses = _table(course, excitations, _metadata(path, film, eyes, params))
             if table == "csv":
@@ -188,9 +187,7 @@ def _pair(values: Array) -> tuple[float, float]:
     return left, right
 
 
-def _table(
-    course: list[overlay.Moment], excitations: list[tuple[float, float]], metadata: dict[str, str]
-) -> pa.Table:
+def _table(course: list[overlay.Moment], excitations: list[tuple[float, float]], metadata: dict[str, str]) -> pa.Table:
     """Put the responses into columns, one row a frame."""
     columns: dict[str, object] = {"frame": range(len(course)), "time": [moment.time for moment in course]}
     for side, name in enumerate(SIDES):
@@ -203,9 +200,7 @@ def _table(
 def _metadata(path: Path, film: video.Video, eyes: Eyes, params: lgmd.Params) -> dict[str, str]:
     numbers = {name: float(getattr(params, name)) for name in ("threshold", "suppression", "inhibition")}
     facts = {"units": UNITS, "eyes": asdict(eyes), "lgmd": numbers, "rate": float(film.rate)}
-    return {"video": path.name, "lgmdjax": __version__} | {
-        key: json.dumps(fact) for key, fact in facts.items()
-    }
+    return {"video": path.name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}
 
 
 @contextmanager

@@ -33,16 +33,12 @@ def row(rooms: arena.Arena, index: int) -> arena.Arena:
     return jax.tree.map(lambda leaf: leaf[index], rooms)
 
 
-def random_capsules(
-    room: arena.Arena, count: int, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def random_capsules(room: arena.Arena, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Leg-sized capsules all over the room, as high as a robot, some of them balls or upright."""
     rng = np.random.default_rng(seed)
     x_min, x_max, y_min, y_max = np.asarray(room.room)
     starts = rng.uniform((x_min, y_min, 0.05), (x_max, y_max, 0.3), (count, 3))
-    ends = np.clip(
-        starts + rng.normal(scale=(0.15, 0.15, 0.05), size=(count, 3)), [-9, -9, 0.05], [9, 9, 0.3]
-    )
+    ends = np.clip(starts + rng.normal(scale=(0.15, 0.15, 0.05), size=(count, 3)), [-9, -9, 0.05], [9, 9, 0.3])
     ends[:5] = starts[:5]
     ends[5:10, :2] = starts[5:10, :2]
     return starts, ends, rng.uniform(0.01, 0.05, count)
@@ -138,12 +134,8 @@ def test_what_hangs_overhead_cannot_be_touched() -> None:
 
 def test_clearance_has_finite_slopes_where_it_has_corners() -> None:
     """Balls and upright capsules on a cylinder's axis, a box's corner and middle; one through the axis."""
-    room = arena.empty_room(
-        boxes=arena.place([[1.0, 1.0]], 0.2, 1.0), cylinders=arena.place([[-1.0, 0.0]], 0.2, 1.0)
-    )
-    starts = jnp.asarray(
-        [[-1.0, 0.0, 0.1], [-1.2, 0.0, 0.1], [0.8, 0.8, 0.1], [1.0, 1.0, 0.1], [0.5, 0.8, 0.1]]
-    )
+    room = arena.empty_room(boxes=arena.place([[1.0, 1.0]], 0.2, 1.0), cylinders=arena.place([[-1.0, 0.0]], 0.2, 1.0))
+    starts = jnp.asarray([[-1.0, 0.0, 0.1], [-1.2, 0.0, 0.1], [0.8, 0.8, 0.1], [1.0, 1.0, 0.1], [0.5, 0.8, 0.1]])
     ends = starts.at[1, 0].set(-0.8).at[3, 2].set(0.3).at[4, 0].set(0.8)
 
     def total(starts: jax.Array, ends: jax.Array, room: arena.Arena) -> jax.Array:
@@ -164,7 +156,7 @@ def test_nearest_knows_walls_and_leaves_out_what_hangs_overhead() -> None:
     room = scenes.indoor_scene()
     starts, ends = jnp.asarray([[0.6, 1.2], [0.6, 2.0]]), jnp.asarray([[0.7, 1.2], [0.6, 2.8]])
     boxes, cylinders = nearest(room, starts, ends)
-    # The table's top would be the nearest to the first; the box ahead of it comes next. The second ends by the wall y = 3.
+    # The table's top would be the nearest to the first; the box ahead comes next. The other ends by the wall.
     np.testing.assert_allclose(boxes.centre, [[1.4, 0.0], [0.0, 3.5]])
     np.testing.assert_allclose(boxes.top, [0.6, float(room.wall_height)])
     np.testing.assert_allclose(cylinders.centre, [[0.4, 1.05], [0.4, 1.85]])
@@ -198,9 +190,7 @@ def test_nearest_gives_a_parked_cylinder_where_there_is_none() -> None:
 
 @pytest.mark.parametrize(("time", "x"), [(0.0, 1.0), (2.0, 1.0), (3.0, 2.0), (4.0, 3.0), (9.0, 3.0)])
 def test_obstacles_move_from_departure_to_arrival(time: float, x: float) -> None:
-    boxes = arena.place(
-        [[1.0, 0.0], [0.0, 1.0]], 0.2, 1.0, goal=[[3.0, 0.0], [0.0, 1.0]], departs=2.0, arrives=4.0
-    )
+    boxes = arena.place([[1.0, 0.0], [0.0, 1.0]], 0.2, 1.0, goal=[[3.0, 0.0], [0.0, 1.0]], departs=2.0, arrives=4.0)
     room = arena.at(arena.empty_room((9.0, 9.0), boxes=boxes), time)
     np.testing.assert_allclose(room.boxes.centre[:2], [[x, 0.0], [0.0, 1.0]])
     np.testing.assert_array_equal(arena.at(room, 99.0).boxes.centre, room.boxes.centre)
@@ -316,9 +306,7 @@ def test_contrast_fades_every_texture_and_nothing_else() -> None:
     ):
         np.testing.assert_array_equal(textures[:, 1], 0.0)
     assert float(np.min(full.boxes.texture[:, 1])) > 0.0
-    np.testing.assert_array_equal(
-        np.delete(full.wall_texture, 1, axis=1), np.delete(plain.wall_texture, 1, axis=1)
-    )
+    np.testing.assert_array_equal(np.delete(full.wall_texture, 1, axis=1), np.delete(plain.wall_texture, 1, axis=1))
     np.testing.assert_array_equal(full.boxes.centre, plain.boxes.centre)
 
 

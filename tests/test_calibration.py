@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lgmdjax import arena, calibration, camera, episodes, lgmd
+from lgmdjax import arena, calibration, camera, lgmd, redraw
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE, Record
 
@@ -145,7 +145,7 @@ def test_survey_equals_the_detector_run_once_a_candidate():
     u, feed_forward = calibration.survey(params, eyes, arenas, walk, CANDIDATES)
     assert u.shape == (2, 8, 2, 3) and feed_forward.shape == (2, 8, 2)
     see = jax.jit(lgmd.step)
-    for robot, pictures in enumerate(jnp.asarray(episodes.redraw(eyes, arenas, walk))):
+    for robot, pictures in enumerate(jnp.asarray(redraw.walks(eyes, arenas, walk))):
         for side in (lgmd.LEFT, lgmd.RIGHT):
             for k, pair in enumerate(zip(CANDIDATES.threshold, CANDIDATES.inhibition, strict=True)):
                 detector = replace(params, threshold=pair[0], inhibition=pair[1], suppression=1e9)

@@ -36,9 +36,7 @@ def test_other_settings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     open_run(tmp_path, "mine", "smoke", 0, SCALES["smoke"])
     line = fails(["reproduce", "--scale", "quick", "--name", "mine", "--out", str(tmp_path)], capsys)
     assert "scale = quick" in line and "made with smoke" in line
-    assert "seed = 1" in fails(
-        ["train", "--scale=smoke", "--name=mine", f"--out={tmp_path}", "--seed=1"], capsys
-    )
+    assert "seed = 1" in fails(["train", "--scale=smoke", "--name=mine", f"--out={tmp_path}", "--seed=1"], capsys)
     fails(["train", "--scale=smoke", f"--out={tmp_path}", "--seed=-1"], capsys)
     assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == [".lock", "run.json"]
 

@@ -3,26 +3,13 @@
 import json
 from types import SimpleNamespace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from lgmdjax import (
-    braitenberg,
-    camera,
-    controller,
-    cpg,
-    drivers,
     episodes,
-    hexapod,
-    laser,
-    lgmd,
-    rollout,
-    shaping,
-    simulation,
 )
 from lgmdjax.errors import InputError
 
@@ -143,42 +130,6 @@ def test_stretches_are_sound_uninterrupted_and_touch_nothing(tmp_path):
 def test_a_missing_stretch_of_time_ends_a_stretch(tmp_path):
     write(tmp_path, record(), record(start=35))
     assert [len(s) for s in episodes.stretches(episodes.read(tmp_path), minimum=1)] == [18, 20] * 2
-
-
-EYES = camera.Params(width=48, height=36, overlap=0.6)
-
-
-def robot(velocity: tuple[float, float]) -> simulation.Params:
-    """A robot that walks a bend whatever it sees."""
-    nerves = controller.Params(
-        lgmd=lgmd.Params(),
-        driver=drivers.Blind(velocity=jnp.asarray(velocity)),
-        cpg=cpg.Params(),
-        shaping=shaping.taught(),
-    )
-    return simulation.Params(controller=nerves, teacher=braitenberg.Params(), camera=EYES, laser=laser.Params())
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("float32")
-def test_pictures_are_drawn_again_from_the_poses(tmp_path):
-    """From Parquet, to the last bit as the walking robots saw them, whatever part of the walk is drawn."""
-    params, model = robot((1.0, 0.6)), hexapod.build()
-    rooms = rollout.random_rooms(jax.random.key(1), 2, density=0.3)
-    states, seen = rollout.start(params, model, rooms, driver=drivers.BLIND), []
-    writer = episodes.Writer(tmp_path, SETTINGS)
-    for _ in range(30):
-        states, chunk = rollout.advance(params, model, rooms, states, driver=drivers.BLIND, frames=1, draw=True)
-        seen.append(np.array(states.controller.lgmd.frame))
-        writer.write(chunk, episode=0, rooms=[0, 1], seed=1)
-    walked = episodes.batched(episodes.read(tmp_path))
-    drawn = episodes.redraw(EYES, rooms.arena, walked)
-    np.testing.assert_array_equal(drawn, np.stack(seen, axis=1))
-    assert np.ptp(drawn, axis=1).max() > 20  # the world does move
-    part, alone = (jax.tree.map(lambda leaf, of=of: leaf[of], walked) for of in (np.s_[:, 7:11], np.s_[1:]))
-    np.testing.assert_array_equal(drawn[:, 7:11], episodes.redraw(EYES, rooms.arena, part))
-    second = jax.tree.map(lambda leaf: leaf[1:], rooms.arena)
-    np.testing.assert_allclose(drawn[1:], episodes.redraw(EYES, second, alone), rtol=0, atol=1e-3)
 
 
 def refused(folder, match, **arguments):

@@ -171,9 +171,7 @@ def test_gradient_is_finite_where_nothing_moves(smooth):
 def test_mirrored_pictures_give_the_same_response():
     frames = jnp.asarray(noise(5, 20, 31))
     for flipped in (frames[:, :, ::-1], frames[:, ::-1]):
-        np.testing.assert_allclose(
-            watch(lgmd.Params(), flipped).u, watch(lgmd.Params(), frames).u, rtol=1e-12
-        )
+        np.testing.assert_allclose(watch(lgmd.Params(), flipped).u, watch(lgmd.Params(), frames).u, rtol=1e-12)
 
 
 @pytest.mark.parametrize("width", [320, 81])

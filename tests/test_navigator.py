@@ -120,13 +120,7 @@ def refused(path):
     with pytest.raises(InputError) as caught:
         navigator.load(path)
     line = str(caught.value)
-    assert (
-        "\n" not in line
-        and str(path) in line
-        and "expected" in line
-        and "got" in line
-        and "makes one" in line
-    )
+    assert "\n" not in line and str(path) in line and "expected" in line and "got" in line and "makes one" in line
     return line
 
 

@@ -45,9 +45,7 @@ def test_the_rays_of_the_comparison_meet_every_kind_of_surface() -> None:
     room = scenes.outdoor_scene()
     origins, directions = rays(room, 10_000)
     each = jax.jit(
-        jax.vmap(
-            lambda o, d: (raycast.to_boxes(room.boxes, o, d), raycast.to_cylinders(room.cylinders, o, d))
-        )
+        jax.vmap(lambda o, d: (raycast.to_boxes(room.boxes, o, d), raycast.to_cylinders(room.cylinders, o, d)))
     )
     crowns = np.asarray(each(origins, directions)[1])[:, 5:10]
     from_below = (crowns < np.inf) & (origins[:, 2:] + crowns * directions[:, 2:] < 1.9 + 1e-9)
@@ -78,9 +76,7 @@ def test_single_precision_is_as_good(float32: None) -> None:
     ],
 )
 def test_rays_along_the_axes_are_exact(direction: tuple[float, float, float], expected: float) -> None:
-    room = arena.empty_room(
-        boxes=arena.place([[1.0, 0.0]], 0.5, 1.0), cylinders=arena.place([[0.0, 1.0]], 0.3, 1.0)
-    )
+    room = arena.empty_room(boxes=arena.place([[1.0, 0.0]], 0.5, 1.0), cylinders=arena.place([[0.0, 1.0]], 0.3, 1.0))
     origin, direction_ = jnp.asarray([0.0, 0.0, 0.2]), jnp.asarray(direction)
     both = jax.jit(jax.value_and_grad(raycast.distance, argnums=(0, 1, 2)))
     far, derivatives = both(room, origin, direction_)
@@ -150,9 +146,7 @@ def test_capsules_have_finite_derivatives() -> None:
     directions = jnp.asarray([along, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
     def total(origins: jax.Array, starts: jax.Array, ends: jax.Array) -> jax.Array:
-        hits = jax.vmap(lambda o, d: raycast.to_capsules(o, d, starts, ends, jnp.asarray(radii)))(
-            origins, directions
-        )
+        hits = jax.vmap(lambda o, d: raycast.to_capsules(o, d, starts, ends, jnp.asarray(radii)))(origins, directions)
         return jnp.sum(jnp.where(jnp.isfinite(hits), hits, 0.0))
 
     slopes = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(origins, jnp.asarray(starts), jnp.asarray(ends))

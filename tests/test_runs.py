@@ -74,9 +74,7 @@ def run(tmp_path: Path) -> Run:
     return open_run(tmp_path, "try", "smoke", 5, SETTINGS)
 
 
-def test_a_finished_run_has_nothing_to_do(
-    pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_finished_run_has_nothing_to_do(pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert pipeline.execute(run) == ["left", "right", "total"]
     assert (run.folder / "total" / "value.txt").read_text() == "21"
     began = capsys.readouterr().out

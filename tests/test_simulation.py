@@ -146,7 +146,7 @@ def test_blind_walk_without_pictures_is_the_same_walk(params, model, start, room
 
 
 def test_chunks_of_a_crowd_are_one_walk(params, model):
-    keys = jax.random.split(jax.random.key(1), 2)
+    keys = jax.random.split(jax.random.key(1), 4)  # two a device
     arenas = [scenes.random_room(key) for key in keys]
     rooms = rollout.stack(
         [simulation.Room(arena=a, starts=a.start[None], key=k) for a, k in zip(arenas, keys, strict=True)]
@@ -156,9 +156,9 @@ def test_chunks_of_a_crowd_are_one_walk(params, model):
     short = rollout.together(
         list(rollout.chunks(crowd, model, rooms, drivers.ANYONE, 1.0, draw=False, chunk_seconds=0.4))
     )
-    assert short.time.shape == (2, 30)
+    assert short.time.shape == (4, 30)
     np.testing.assert_allclose(short.time[0], np.arange(30) / 30)
-    one = jax.tree.map(lambda leaf: leaf[1], rooms)
+    one = jax.tree.map(lambda leaf: leaf[3], rooms)
     state = simulation.init(crowd, model, one, drivers.ANYONE)
     _, alone = jax.jit(lambda s: rollout.walk(crowd, model, one, s, drivers.ANYONE, 30, False))(state)
-    np.testing.assert_allclose(short.position[1], alone.position, atol=1e-8)
+    np.testing.assert_allclose(short.position[3], alone.position, atol=1e-8)

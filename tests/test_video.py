@@ -84,9 +84,7 @@ def test_smaller_pictures_are_averaged_not_sampled(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("turn", "corner"), [((0, 1, -1, 0), "top right"), ((-1, 0, 0, -1), "bottom right")])
-def test_a_phone_held_upright_is_turned_upright(
-    tmp_path: Path, turn: tuple[int, int, int, int], corner: str
-) -> None:
+def test_a_phone_held_upright_is_turned_upright(tmp_path: Path, turn: tuple[int, int, int, int], corner: str) -> None:
     """Players obey the matrix in the track's header; a bright top left corner then shows elsewhere."""
     bright = np.zeros((4, HEIGHT, WIDTH), np.uint8)
     bright[:, : HEIGHT // 2, : WIDTH // 2] = 220

@@ -185,9 +185,7 @@ def test_a_failure_keeps_the_results_of_an_earlier_time(tmp_path: Path) -> None:
     assert {file.name: file.read_bytes() for file in (tmp_path / "out" / "disc").iterdir()} == before
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save(tmp_path / "disc.mp4", looming(72))
     assert cli.main(["watch", str(path), "--out", str(path)]) == 2
     assert len(lines := said(capsys)) == 1 and "can be written" in lines[0]

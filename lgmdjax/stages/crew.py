@@ -40,9 +40,7 @@ def robot(gait: Path, settings: scales.Eyes, detector: lgmd.Params, crew: driver
         cpg=_arrays(cpg.Params()),
         shaping=shaping.load(gait / "shaping.safetensors"),
     )
-    return simulation.Params(
-        controller=nerves, teacher=teacher, camera=eyes(settings), laser=_arrays(laser.Params())
-    )
+    return simulation.Params(controller=nerves, teacher=teacher, camera=eyes(settings), laser=_arrays(laser.Params()))
 
 
 def everyone(

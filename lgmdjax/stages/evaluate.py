@@ -20,6 +20,7 @@ from lgmdjax import (
     hexapod,
     lgmd,
     navigator,
+    redraw,
     rollout,
     scales,
     scenes,
@@ -111,7 +112,7 @@ def _layers(detector: lgmd.Params, eyes: scales.Eyes, walk: simulation.Record) -
     steady = np.where(np.asarray(walk.setbacks) == walk.setbacks[-1], walk.excitation[:, 0], 0.0)
     last = max(int(np.argmax(steady)), 2)
     pictures = [
-        episodes.picture(camera.Params(), scenes.testing_room(), walk.time[k], walk.position[k], walk.quaternion[k])[0]
+        redraw.frame(camera.Params(), scenes.testing_room(), walk.time[k], walk.position[k], walk.quaternion[k])[0]
         for k in range(last - 2, last + 1)
     ]
     state, _ = lgmd.step(detector, lgmd.init(detector, pictures[0]), pictures[1])

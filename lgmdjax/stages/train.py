@@ -84,9 +84,7 @@ def _own_walks(
         params = crew.robot(inputs["fit-gait"], settings.eyes, detector, learned)
         rooms = collect.rooms_of(seed, episode, settings.robots)
         label = f"train: its own walk {number + 1} of {settings.rounds}"
-        chunks = crew.walks(
-            crew.seat(params, drivers.LEARNED), hexapod.build(), rooms, settings.round_seconds, label
-        )
+        chunks = crew.walks(crew.seat(params, drivers.LEARNED), hexapod.build(), rooms, settings.round_seconds, label)
         numbers = episode * settings.robots + np.arange(settings.robots)
         writer.write(rollout.together(list(chunks)), episode=episode, rooms=numbers.tolist(), seed=seed)
     return episodes.stretches(episodes.read(place))

@@ -47,9 +47,7 @@ def load(xml: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
-def ray(
-    model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, directions: np.ndarray
-) -> np.ndarray:
+def ray(model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Cast single rays (n, 3) with C `mj_ray`; inf where nothing is hit."""
     geom = np.zeros(1, dtype=np.int32)
     hits = [

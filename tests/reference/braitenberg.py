@@ -17,9 +17,7 @@ def vehicle_3b(u_l: float, u_r: float, v_base: float, k_3b: float) -> tuple[floa
     return v_base - k_3b * u_r, v_base - k_3b * u_l
 
 
-def rule(
-    d_l: float, d_r: float, v_base: float = 1.2, k_2a: float = 0.8, k_3b: float = 0.6
-) -> tuple[float, float]:
+def rule(d_l: float, d_r: float, v_base: float = 1.2, k_2a: float = 0.8, k_3b: float = 0.6) -> tuple[float, float]:
     v_l = v_base + k_2a * (1 / d_l) - k_3b * (1 / d_r)
     v_r = v_base + k_2a * (1 / d_r) - k_3b * (1 / d_l)
     return v_l, v_r

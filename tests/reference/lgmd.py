@@ -52,8 +52,6 @@ def lgmd(
         u = 1 / (1 + math.exp(-U / n_cell))  # eq. 14
         ff = (P_before if printed_feed_forward else np.abs(P_before)).sum() / n_cell  # eq. 15
         shown = ff > suppression if printed_gate else not ff > suppression  # eq. 16
-        out.append(
-            {"u": u if shown else 0.5, "feed_forward": ff, "excitation": U / n_cell, "E": E, "I": I, "S": S}
-        )
+        out.append({"u": u if shown else 0.5, "feed_forward": ff, "excitation": U / n_cell, "E": E, "I": I, "S": S})
         P_before, L_before = P, L
     return out

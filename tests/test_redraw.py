@@ -1,0 +1,58 @@
+"""The pictures of a recorded walk are what the walking robots saw."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lgmdjax import (
+    braitenberg,
+    camera,
+    controller,
+    cpg,
+    drivers,
+    episodes,
+    hexapod,
+    laser,
+    lgmd,
+    redraw,
+    rollout,
+    shaping,
+    simulation,
+)
+
+ROBOTS = 4  # two a device
+EYES = camera.Params(width=48, height=36, overlap=0.6)
+
+
+def robot(velocity: tuple[float, float]) -> simulation.Params:
+    """A robot that walks a bend whatever it sees."""
+    nerves = controller.Params(
+        lgmd=lgmd.Params(),
+        driver=drivers.Blind(velocity=jnp.asarray(velocity)),
+        cpg=cpg.Params(),
+        shaping=shaping.taught(),
+    )
+    return simulation.Params(controller=nerves, teacher=braitenberg.Params(), camera=EYES, laser=laser.Params())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("float32")
+def test_pictures_are_drawn_again_from_the_poses(tmp_path):
+    """From Parquet, to the last bit as the walking robots saw them, whatever part of the walk is drawn."""
+    params, model = robot((1.0, 0.6)), hexapod.build()
+    rooms = rollout.random_rooms(jax.random.key(1), ROBOTS, density=0.3)
+    states, seen = rollout.start(params, model, rooms, driver=drivers.BLIND), []
+    writer = episodes.Writer(tmp_path, {})
+    for _ in range(30):
+        states, chunk = rollout.advance(params, model, rooms, states, driver=drivers.BLIND, frames=1, draw=True)
+        seen.append(np.array(states.controller.lgmd.frame))
+        writer.write(chunk, episode=0, rooms=range(ROBOTS), seed=1)
+    walked = episodes.batched(episodes.read(tmp_path))
+    drawn = redraw.walks(EYES, rooms.arena, walked)
+    np.testing.assert_array_equal(drawn, np.stack(seen, axis=1))
+    assert np.ptp(drawn, axis=1).max() > 20  # the world does move
+    part, alone = (jax.tree.map(lambda leaf, of=of: leaf[of], walked) for of in (np.s_[:, 7:11], np.s_[1:]))
+    np.testing.assert_array_equal(drawn[:, 7:11], redraw.walks(EYES, rooms.arena, part))
+    second = jax.tree.map(lambda leaf: leaf[1:], rooms.arena)
+    np.testing.assert_allclose(drawn[1:], redraw.walks(EYES, second, alone), rtol=0, atol=1e-3)
