@@ -23,14 +23,9 @@ import numpy as np
 from lgmdjax import (
     braitenberg,
     camera,
-    controller,
-    cpg,
     drivers,
     hexapod,
-    laser,
-    lgmd,
     rollout,
-    shaping,
     simulation,
 )
 
@@ -41,12 +36,7 @@ REPEATS = 5
 
 def robot(width: int, height: int) -> simulation.Params:
     """Put a robot together that its teacher drives and whose eyes draw the whole picture."""
-    teacher = _arrays(braitenberg.Params())
-    nerves = controller.Params(
-        lgmd=_arrays(lgmd.Params()), driver=teacher, cpg=_arrays(cpg.Params()), shaping=shaping.taught()
-    )
-    eyes = camera.Params(width=width, height=height)
-    return simulation.Params(controller=nerves, teacher=teacher, camera=eyes, laser=_arrays(laser.Params()))
+    return simulation.assemble(braitenberg.Params(), eyes=camera.Params(width=width, height=height))
 
 
 def measure(params: simulation.Params, robots: int) -> tuple[float, float]:
@@ -105,10 +95,6 @@ def main() -> None:
                 f"{reference:16.1f}  {rate / reference:5.2f}",
                 flush=True,
             )
-
-
-def _arrays(params):
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), params)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
-from lgmdjax import arena, braitenberg, camera, controller, hexapod, laser
+from lgmdjax import arena, braitenberg, camera, controller, cpg, hexapod, laser, lgmd, shaping
 from lgmdjax.drivers import Driver, Senses
 
 Leaf = Array | np.ndarray
@@ -80,6 +80,36 @@ class Record:
     fresh: Bool[Leaf, ""]
     setbacks: Int[Leaf, ""]
     ok: Bool[Leaf, ""]
+
+
+def assemble(
+    driver: Any,
+    *,
+    detector: lgmd.Params | None = None,
+    rhythm: cpg.Params | None = None,
+    networks: shaping.Params | None = None,
+    teacher: braitenberg.Params | None = None,
+    eyes: camera.Params | None = None,
+    scanner: laser.Params | None = None,
+) -> Params:
+    """Put a robot together from its driver's parameters and whatever else is not the default.
+
+    Plain numbers become arrays, so that a program compiled for some values serves all, and can be differentiated in
+    them. The default networks are those that come with the package (`shaping.taught`).
+    """
+    nerves = controller.Params(
+        lgmd=detector or lgmd.Params(),
+        driver=driver,
+        cpg=rhythm or cpg.Params(),
+        shaping=networks or shaping.taught(),
+    )
+    params = Params(
+        controller=nerves,
+        teacher=teacher or braitenberg.Params(),
+        camera=eyes or camera.Params(),
+        laser=scanner or laser.Params(),
+    )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if np.isscalar(leaf) else leaf, params)
 
 
 def init(params: Params, model: mjx.Model, room: Room, driver: Driver) -> State:

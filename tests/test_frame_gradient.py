@@ -11,16 +11,12 @@ import numpy as np
 
 from lgmdjax import (
     arena,
-    braitenberg,
     camera,
-    controller,
     cpg,
     drivers,
     hexapod,
-    laser,
     lgmd,
     navigator,
-    shaping,
     simulation,
 )
 
@@ -28,23 +24,15 @@ from lgmdjax import (
 QUICKLY_COMPILED = {"xla_backend_optimization_level": 0}
 
 
-def asarray(tree):
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if isinstance(leaf, float) else leaf, tree)
-
-
 def robot() -> simulation.Params:
     """A robot that looks and walks, its thresholds smooth."""
-    detector = lgmd.Params(threshold=0.5, suppression=30.0, suppression_width=10.0, smooth=True)
-    nerves = controller.Params(
-        lgmd=asarray(detector),
-        driver=navigator.create(jax.random.key(3)),
+    return simulation.assemble(
+        navigator.create(jax.random.key(3)),
+        detector=lgmd.Params(threshold=0.5, suppression=30.0, suppression_width=10.0, smooth=True),
         # In one Runge-Kutta step: four take long to compile, and are tested by themselves.
-        cpg=asarray(cpg.Params(substeps=1)),
-        shaping=shaping.taught(),
+        rhythm=cpg.Params(substeps=1),
+        eyes=camera.Params(width=48, height=36, overlap=0.6),
     )
-    eyes = camera.Params(width=48, height=36, overlap=0.6)
-    teacher, scanner = asarray(braitenberg.Params()), asarray(laser.Params())
-    return simulation.Params(controller=nerves, teacher=teacher, camera=eyes, laser=scanner)
 
 
 def room() -> simulation.Room:

@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 
 from lgmdjax import (
-    braitenberg,
     camera,
-    controller,
-    cpg,
     drivers,
     episodes,
     hexapod,
-    laser,
-    lgmd,
     redraw,
     rollout,
-    shaping,
     simulation,
 )
 
@@ -25,22 +19,12 @@ ROBOTS = 4  # two a device
 EYES = camera.Params(width=48, height=36, overlap=0.6)
 
 
-def robot(velocity: tuple[float, float]) -> simulation.Params:
-    """A robot that walks a bend whatever it sees."""
-    nerves = controller.Params(
-        lgmd=lgmd.Params(),
-        driver=drivers.Blind(velocity=jnp.asarray(velocity)),
-        cpg=cpg.Params(),
-        shaping=shaping.taught(),
-    )
-    return simulation.Params(controller=nerves, teacher=braitenberg.Params(), camera=EYES, laser=laser.Params())
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("float32")
 def test_pictures_are_drawn_again_from_the_poses(tmp_path):
     """From Parquet, to the last bit as the walking robots saw them, whatever part of the walk is drawn."""
-    params, model = robot((1.0, 0.6)), hexapod.build()
+    bend = drivers.Blind(velocity=jnp.asarray([1.0, 0.6]))
+    params, model = simulation.assemble(bend, eyes=EYES), hexapod.build()
     rooms = rollout.random_rooms(jax.random.key(1), ROBOTS, density=0.3)
     states, seen = rollout.start(params, model, rooms, driver=drivers.BLIND), []
     writer = episodes.Writer(tmp_path, {})

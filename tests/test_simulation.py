@@ -11,25 +11,17 @@ from lgmdjax import (
     arena,
     braitenberg,
     camera,
-    controller,
-    cpg,
     drivers,
     hexapod,
-    laser,
     lgmd,
     navigator,
     rollout,
     scenes,
-    shaping,
     simulation,
 )
 
 MIRRORED_LEGS = np.array([5, 4, 3, 2, 1, 0])
 FRAMES = 20
-
-
-def asarray(tree):
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if isinstance(leaf, float) else leaf, tree)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +31,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def params():
-    teacher = asarray(braitenberg.Params())
+    teacher = braitenberg.Params()
     everyone = drivers.Anyone(
         seat=jnp.asarray(0),
         drivers=(
@@ -50,14 +42,9 @@ def params():
             drivers.Replay(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0]])),
         ),
     )
-    nerves = controller.Params(
-        lgmd=asarray(lgmd.Params(threshold=0.5, suppression=30.0, smooth=True)),
-        driver=everyone,
-        cpg=asarray(cpg.Params()),
-        shaping=shaping.taught(),
-    )
+    detector = lgmd.Params(threshold=0.5, suppression=30.0, smooth=True)
     eyes = camera.Params(width=48, height=36, overlap=0.6)
-    return simulation.Params(controller=nerves, teacher=teacher, camera=eyes, laser=asarray(laser.Params()))
+    return simulation.assemble(everyone, detector=detector, eyes=eyes)
 
 
 @pytest.fixture(scope="module")

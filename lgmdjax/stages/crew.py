@@ -13,10 +13,7 @@ from tqdm import tqdm
 from lgmdjax import (
     braitenberg,
     camera,
-    controller,
-    cpg,
     drivers,
-    laser,
     lgmd,
     navigator,
     rollout,
@@ -33,14 +30,8 @@ def eyes(settings: scales.Eyes) -> camera.Params:
 
 def robot(gait: Path, settings: scales.Eyes, detector: lgmd.Params, crew: drivers.Anyone) -> simulation.Params:
     """Put a robot together: the gait that was fitted, the eyes of the run, and anyone at the wheel."""
-    teacher = crew.drivers[0]
-    nerves = controller.Params(
-        lgmd=_arrays(detector),
-        driver=crew,
-        cpg=_arrays(cpg.Params()),
-        shaping=shaping.load(gait / "shaping.safetensors"),
-    )
-    return simulation.Params(controller=nerves, teacher=teacher, camera=eyes(settings), laser=_arrays(laser.Params()))
+    networks = shaping.load(gait / "shaping.safetensors")
+    return simulation.assemble(crew, detector=detector, networks=networks, eyes=eyes(settings))
 
 
 def everyone(
@@ -52,8 +43,8 @@ def everyone(
         learned: the trained navigator. gain: of the direct driver [1/m].
         replayed: `REPLAY` commands of the teacher for the random driver.
     """
-    teacher = _arrays(braitenberg.Params())
-    straight = jnp.stack([teacher.base, teacher.base])
+    teacher = braitenberg.Params()
+    straight = jnp.full(2, teacher.base, dtype=float)
     commands = jnp.broadcast_to(straight, (REPLAY, 2)) if replayed is None else jnp.asarray(replayed, dtype=float)
     return drivers.Anyone(
         seat=jnp.asarray(0),
@@ -98,8 +89,3 @@ def walks(
 
 CHUNK = 5.0  # s of robot time between two signs of life, and what an interruption loses
 BAR = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"
-
-
-def _arrays(params):
-    """Make arrays of a component's numbers, so that a program compiled for one value serves all."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), params)
