@@ -35,6 +35,7 @@ test: setup
 
 lint: setup
 	'$(VENV)/bin/ruff' check .
+	'$(VENV)/bin/ruff' format --check .
 	'$(VENV)/bin/pyright' --pythonpath '$(VENV)/bin/python'
 
 clean:

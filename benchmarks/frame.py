@@ -46,7 +46,8 @@ def measure(params: simulation.Params, robots: int) -> tuple[float, float]:
     fixed = {"driver": drivers.TEACHER, "frames": FRAMES}
     compiled = rollout.advance.lower(params, model, rooms, states, draw=jnp.asarray(True), **fixed).compile()
     analysis = compiled.memory_analysis()
-    memory = analysis.temp_size_in_bytes / 1e6 / robots if analysis else math.nan  # not every device tells
+    share = robots / len(rollout.devices(robots))
+    memory = analysis.temp_size_in_bytes / 1e6 / share if analysis else math.nan  # not every device tells
     seconds = []
     for _ in range(REPEATS + 1):  # the first is thrown away
         began = time.perf_counter()
@@ -83,6 +84,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=[1, 16])
     robots = parser.parse_args().robots
+    jax.config.update("jax_num_cpu_devices", os.cpu_count())  # crowds on all cores, as from the command line
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco"))
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores; {versions}")
     print("pixels      robots  robot-frames/s  asked  MB a robot  by hand, 1 robot  ratio")

@@ -27,7 +27,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lgmdjax import layers, lgmd, silhouettes
+from lgmdjax import edges, layers, lgmd, silhouettes
 from lgmdjax.arena import Arena
 from lgmdjax.errors import InputError
 from lgmdjax.texture import WAVES
@@ -204,7 +204,7 @@ def _eye(params: Params, arena: Arena, position: Array, rotation: Array, field: 
         x, y, z = (rotation[i, 0] * rays[0] + rotation[i, 1] * rays[1] + rotation[i, 2] * rays[2] for i in range(3))
         return x, y, z
 
-    rays = layers.rays(turned(field.d), turned(field.d_u), turned(field.d_v))
+    rays = edges.rays(turned(field.d), turned(field.d_u), turned(field.d_v))
     return layers.draw(arena, position, rays, picked, params.bands)
 
 

@@ -180,9 +180,7 @@ def teach(
     """
     lesson = _lesson(geometry, gait or Gait(), network or cpg.Params(), literal)
     keys = jax.random.split(jax.random.key(0) if key is None else key, (candidates, 3))
-    networks = jax.vmap(jax.vmap(_start, in_axes=(None, 2, 0)), in_axes=(None, None, 0))(
-        lesson.inputs, lesson.targets, keys
-    )
+    networks = _starts(lesson.inputs, lesson.targets, keys)
     left = replace(geometry, mounts=geometry.mounts[:3], mount_yaws=geometry.mount_yaws[:3])
     search = steps // 8
     networks = _descend(_search_loss, networks, left, lesson, 0.01, range(search), progress)
@@ -219,9 +217,8 @@ def _lesson(geometry: Geometry, gait: Gait, network: cpg.Params, literal: bool) 
         axis=2,
     )
     scale = np.maximum(np.abs(inputs).max((0, 1)) * np.array([0.7, 0.7, 0.5]), 1e-6)
-    angles = targets(
-        geometry,
-        gait,
+    # As programs: operation by operation they would take longer to compile than all else here.
+    angles = jax.jit(partial(targets, geometry, gait))(
         jnp.broadcast_to(jnp.asarray(phases, dtype=float)[:, None, None], (*grid, 6)),
         jnp.broadcast_to(jnp.asarray(velocities, dtype=float)[None, :, None], (*grid, 6)),
     )
@@ -234,7 +231,7 @@ def _lesson(geometry: Geometry, gait: Gait, network: cpg.Params, literal: bool) 
         inputs=inputs / scale,
         scale=scale,
         targets=angles[:, :, :3],
-        feet=forward(geometry, angles)[:, :, :3],
+        feet=jax.jit(forward)(geometry, angles)[:, :, :3],
         stance=stance,
         weight=np.outer(SWING + (1 - SWING) * np.exp(-rise / SKIM), importance)
         / np.sqrt(3 * stance.sum() * len(velocities)),
@@ -253,8 +250,11 @@ def _trunk(gait: Gait) -> Float[np.ndarray, "6 9"]:
     return np.linalg.pinv(np.vstack(rows))
 
 
-def _start(inputs: Float[Array, "p v 3"], targets: Float[Array, "p v 3"], key: Array) -> _Networks:
-    """Draw a network: units that bend at random points of the lesson, and the output layer that fits best."""
+@jax.jit
+@partial(jax.vmap, in_axes=(None, None, 0))
+@partial(jax.vmap, in_axes=(None, 2, 0))
+def _starts(inputs: Float[Array, "p v 3"], targets: Float[Array, "p v 3"], key: Array) -> _Networks:
+    """Draw networks, (candidates, legs): units that bend at random points of the lesson, and the output layer that fits best."""
     x, y = inputs.reshape(-1, 3), targets.reshape(-1, 3)
     first, second = jax.random.split(key)
     w1 = jax.random.normal(first, (3, shaping.UNITS), dtype=float)
@@ -282,6 +282,7 @@ def _search_loss(networks: _Networks, left: Geometry, lesson: _Lesson) -> Float[
     return jnp.sum(_feet_loss(_foot_errors(networks, left, lesson), lesson))
 
 
+@jax.jit
 def _best(networks: _Networks, left: Geometry, lesson: _Lesson) -> _Networks:
     """Choose each leg's best candidate."""
     losses = _feet_loss(_foot_errors(networks, left, lesson), lesson)

@@ -3,16 +3,11 @@
 Everything here is elementwise over rays, so that XLA makes one vectorised loop of it. Components of vectors are
 arrays of their own for the same reason.
 
-| symbol   | name                                         | unit | where                                          |
-| -------- | -------------------------------------------- | ---- | ---------------------------------------------- |
-| d        | direction of a ray in the world              | 1    |                                                |
-| d_u, d_v | its change from column to column, row to row | 1/px |                                                |
-| s        | surface as inverse depth, 1/t = s . d        | 1/m  | `silhouettes`                                  |
-| m        | margin by which a ray is inside an outline   |      |                                                |
-| p, q     | the larger and the smaller slope of m        | 1/px | of abs(dm/du), abs(dm/dv)                      |
-| k        | slant of an edge                             | 1    | q/p: 0 along rows or columns, 1 halfway        |
-| a        | part of a pixel that is inside               | 1    | `_part` of m/p and k, exact; at the ends of    |
-|          |                                              |      | prisms `_ramp`, to 0.07                        |
+| symbol | name                                      | unit | where         |
+| ------ | ----------------------------------------- | ---- | ------------- |
+| d      | direction of a ray in the world           | 1    | `edges`       |
+| s      | surface as inverse depth, 1/t = s . d     | 1/m  | `silhouettes` |
+| a      | part of a pixel that a surface covers     | 1    | `edges`       |
 """
 
 import functools
@@ -24,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from lgmdjax import texture
+from lgmdjax import edges, texture
 from lgmdjax.arena import Arena
 from lgmdjax.silhouettes import NEAR, Pair, Silhouette
 from lgmdjax.texture import Texture, Vector
@@ -39,22 +34,6 @@ _OPEN = 1.0e4
 """A margin [px], or an inverse depth [1/m], that stands for no limit at all."""
 _BACK = 0.97
 """Walls count as farther away, so that what touches them is not cut by them within a pixel of its outline."""
-
-
-class Rays(NamedTuple):
-    """One ray a pixel, and how it turns from pixel to pixel."""
-
-    d: Vector
-    d_u: Vector
-    d_v: Vector
-    slant: "_Slant"
-    """Of upright edges."""
-    across: Pair
-    """(d_x, d_y)/p for upright edges: times a plane's unit normal, the margin in pixels."""
-    rightward: Pair
-    """Columns and rows to the right, across upright edges, for a pixel of margin."""
-    turn: Pair
-    """What that adds to d_x and d_y."""
 
 
 class Layer(NamedTuple):
@@ -72,19 +51,8 @@ class Layer(NamedTuple):
     texture: Texture
 
 
-def rays(d: Vector, d_u: Vector, d_v: Vector) -> Rays:
-    """Complete rays given by their directions and how these change."""
-    m_u, m_v = d[1] * d_u[0] - d[0] * d_u[1], d[1] * d_v[0] - d[0] * d_v[1]
-    slant = _slant(m_u, m_v)
-    inverse = slant.per_p
-    per_pixel = _once(jnp.sqrt(d[0] * d[0] + d[1] * d[1] + 1e-12)) * inverse
-    across, (right_u, right_v) = (d[0] * per_pixel, d[1] * per_pixel), (m_u * inverse, m_v * inverse)
-    turn = right_u * d_u[0] + right_v * d_v[0], right_u * d_u[1] + right_v * d_v[1]
-    return Rays(d, d_u, d_v, slant, across, (right_u, right_v), turn)
-
-
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
-def draw(arena: Arena, eye: Array, pixels: Rays, prisms: list[Silhouette], bands: int) -> Array:
+def draw(arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette], bands: int) -> Array:
     """Blend the two nearest layers of every pixel over the mean grey of the third and of what is behind that.
 
     Gradient: that of the same drawing with its loops as `lax.scan`. Unrolled they are one expression, the fastest to
@@ -98,7 +66,7 @@ def _draw_jvp(bands: int, primals: tuple, tangents: tuple) -> tuple[Array, Array
     return jax.jvp(functools.partial(_draw, _scanned, bands=bands), primals, tangents)
 
 
-def _draw(scan: Callable, arena: Arena, eye: Array, pixels: Rays, prisms: list[Silhouette], bands: int) -> Array:
+def _draw(scan: Callable, arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette], bands: int) -> Array:
     room = _room(arena, eye, pixels)
     background = room.first.nearness
     third = _Plain(background, jnp.zeros_like(background), jnp.zeros_like(background))
@@ -115,7 +83,7 @@ def _draw(scan: Callable, arena: Arena, eye: Array, pixels: Rays, prisms: list[S
     rest = jnp.where(third.nearness > background, room.behind_three, behind_two)
     rest = rest + third.cover * (third.grey - rest)
     # What the first layer leaves of a pixel has its middle opposite.
-    opposite = _once(-first.cover / (1.001 - first.cover))
+    opposite = edges.once(-first.cover / (1.001 - first.cover))
     shift = first.shift[0] * opposite, first.shift[1] * opposite
     _, (nearer, farther) = scan(shade, None, [first, second._replace(shift=shift)])
     return rest + second.cover * (1.0 - first.cover) * (farther - rest) + first.cover * (nearer - rest)
@@ -156,23 +124,23 @@ def _plain(layer: Layer) -> _Plain:
     return _Plain(layer.nearness, layer.cover, layer.texture.brightness)
 
 
-def _prism(prism: Silhouette, pixels: Rays) -> Layer:
+def _prism(prism: Silhouette, pixels: edges.Rays) -> Layer:
     """What a prism covers of each pixel, and with which face."""
     d, (across_x, across_y) = pixels.d, pixels.across
     beyond = (prism.open - 0.5) * _OPEN
-    left = _part(prism.left[0] * across_x + prism.left[1] * across_y + beyond, pixels.slant)
-    right = _part(prism.right[0] * across_x + prism.right[1] * across_y + beyond, pixels.slant)
+    left = edges.part(prism.left[0] * across_x + prism.left[1] * across_y + beyond, pixels.slant)
+    right = edges.part(prism.right[0] * across_x + prism.right[1] * across_y + beyond, pixels.slant)
     by_side = 0.5 * (right - left)
     near, far = _sides(prism, pixels, by_side)
-    side = _slopes(near, pixels)
+    side = edges.slopes(near, pixels)
     # From within its wedge a prism can be entered by its lid only, and only the lid ends.
     within, lidless = prism.open > 0.75, prism.lid == 0
-    last = _slopes(choose(lidless, near, far), pixels)
+    last = edges.slopes(choose(lidless, near, far), pixels)
     upward = jnp.where(prism.lid > 0, -1.0, 1.0).astype(prism.lid.dtype)
-    lid_rise, lid_shift = _rise(prism.lid_end, last, pixels)
-    other_rise, other_shift = _rise(prism.other_end, side, pixels)
-    to_lid = _ramp(upward * lid_rise + jnp.where(within & lidless, _OPEN, 0.0))
-    to_other = _ramp(jnp.where(within, _OPEN, 0.0) - upward * other_rise)
+    lid_rise, lid_shift = edges.rise(prism.lid_end, last, pixels)
+    other_rise, other_shift = edges.rise(prism.other_end, side, pixels)
+    to_lid = edges.ramp(upward * lid_rise + jnp.where(within & lidless, _OPEN, 0.0))
+    to_other = edges.ramp(jnp.where(within, _OPEN, 0.0) - upward * other_rise)
     by_lid_end, by_other_end = 0.5 * upward * (1.0 - to_lid), 0.5 * upward * (to_other - 1.0)
     shift_u, shift_v = (
         by_lid_end * lid_shift[i] + by_other_end * other_shift[i] + by_side * pixels.rightward[i] for i in (0, 1)
@@ -185,7 +153,7 @@ def _prism(prism: Silhouette, pixels: Rays) -> Layer:
     return Layer(nearness, cover, (shift_u, shift_v), s, prism.centre, prism.texture)
 
 
-def _sides(prism: Silhouette, pixels: Rays, shift: Array) -> tuple[Pair, Pair]:
+def _sides(prism: Silhouette, pixels: edges.Rays, shift: Array) -> tuple[Pair, Pair]:
     """s of the sides by which rays enter and leave, were the prism endless upward and downward.
 
     The rays are those through the middle of what is covered of a pixel, `shift` to the right of its own.
@@ -228,72 +196,6 @@ def _round_sides(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[P
     return (p_x + e_x, p_y + e_y), (p_x - e_x, p_y - e_y)
 
 
-def _slopes(s: Pair, pixels: Rays) -> Vector:
-    """1/t on an upright face, and its change from column to column and row to row."""
-    x, y, z = (s[0] * d[0] + s[1] * d[1] for d in (pixels.d, pixels.d_u, pixels.d_v))
-    return x, y, z
-
-
-def _rise(z: Array, slopes: Vector, pixels: Rays) -> tuple[Array, Pair]:
-    """Margin in pixels by which rays pass below the height z on a face, and the way to more of it."""
-    m, m_u, m_v = _below(z, slopes, pixels)
-    across, along = jnp.abs(m_u), jnp.abs(m_v)
-    # Aslant an edge is smeared farther; of straight ramps this one is the nearest.
-    inverse = _once(1.0 / (jnp.maximum(across, along) + 0.2 * jnp.minimum(across, along) + 1e-9))
-    return m * inverse, (m_u * inverse, m_v * inverse)
-
-
-def _part_below(z: Array, slopes: Vector, pixels: Rays) -> tuple[Array, Pair]:
-    """Part of a pixel that is below the height z on a face, and the way to more of it."""
-    return _part_and_way(_below(z, slopes, pixels))
-
-
-def _below(z: Array, slopes: Vector, pixels: Rays) -> Vector:
-    """m = z/t - d_z on a face, and its slopes."""
-    m, m_u, m_v = (z * a - d[2] for a, d in zip(slopes, (pixels.d, pixels.d_u, pixels.d_v), strict=True))
-    return m, m_u, m_v
-
-
-class _Slant(NamedTuple):
-    """How an edge lies in a pixel: p, 1/p, k/2 and 1/k."""
-
-    p: Array
-    per_p: Array
-    half: Array
-    inverse: Array
-
-
-def _slant(m_u: Array, m_v: Array) -> _Slant:
-    m_u, m_v = jnp.abs(m_u), jnp.abs(m_v)
-    p = jnp.maximum(m_u, m_v) + 1e-9
-    q = jnp.maximum(jnp.minimum(m_u, m_v), 1e-3 * p)
-    both = _once(1.0 / (p * q))  # one division for all
-    return _Slant(p, q * both, 0.5 * q * q * both, p * p * both)
-
-
-def _part(margin: Array, slant: _Slant) -> Array:
-    """a: part of a pixel on the inner side of a straight edge that is m/p inside of its middle.
-
-    The other part, or where it is the larger this one, is a corner: a triangle of height x, cut at k.
-    """
-    x = jnp.maximum(0.5 + slant.half - jnp.abs(margin), 0.0)
-    cut = jnp.minimum(x, 2.0 * slant.half)
-    corner = slant.inverse * (x - 0.5 * cut) * cut
-    return jnp.where(margin > 0, 1.0 - corner, corner)
-
-
-def _part_and_way(margin: Vector) -> tuple[Array, Pair]:
-    """Part of a pixel where a margin, given with its slopes, is positive, and the way to more of it."""
-    m, m_u, m_v = margin
-    slant = _slant(m_u, m_v)
-    return _part(m * slant.per_p, slant), (m_u * slant.per_p, m_v * slant.per_p)
-
-
-def _ramp(margin: Array) -> Array:
-    """`_part` at half its price, for an edge whose margin is in units of its smear."""
-    return jnp.clip(0.5 + margin, 0.0, 1.0)
-
-
 class _Room(NamedTuple):
     """Walls, floor and sky of every pixel: two layers, and what is behind."""
 
@@ -307,14 +209,14 @@ class _Room(NamedTuple):
     """Mean grey of the room, if three are."""
 
 
-def _room(arena: Arena, eye: Array, pixels: Rays) -> _Room:
+def _room(arena: Arena, eye: Array, pixels: edges.Rays) -> _Room:
     """Draw the room without obstacles: wall or floor, whichever has more of the pixel, then what it shares it with."""
     by_x, along_x, along_y = _walls(arena, eye, pixels.d)
     wall_s, other_s = choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)
-    slopes = _slopes(wall_s, pixels)
+    slopes = edges.slopes(wall_s, pixels)
     part, corner_shift = _part_of_nearer(wall_s, other_s, pixels)
-    floor, floor_shift = _part_below(-eye[2], slopes, pixels)
-    below_top, top_shift = _part_below(arena.wall_height - eye[2], slopes, pixels)
+    floor, floor_shift = edges.part_below(-eye[2], slopes, pixels)
+    below_top, top_shift = edges.part_below(arena.wall_height - eye[2], slopes, pixels)
     sky = 1.0 - below_top
     wall = jnp.maximum(1.0 - floor - sky, 0.0)
 
@@ -360,15 +262,15 @@ def _walls(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
     return s_x * d[0] > s_y * d[1], (s_x, zero), (zero, s_y)
 
 
-def _part_of_nearer(wall: Pair, other: Pair, pixels: Rays) -> tuple[Array, Pair]:
+def _part_of_nearer(wall: Pair, other: Pair, pixels: edges.Rays) -> tuple[Array, Pair]:
     """Part of a pixel that the nearer of two walls has, the rest being round the corner, and the way to more of it."""
-    return _part_and_way(_slopes((wall[0] - other[0], wall[1] - other[1]), pixels))
+    return edges.part_and_way(edges.slopes((wall[0] - other[0], wall[1] - other[1]), pixels))
 
 
-def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int) -> Array:
+def _shade(handedness: Array, eye: Array, pixels: edges.Rays, layer: Layer, bands: int) -> Array:
     """Grey of a layer where the rays meet it, averaged over the pixel."""
     d, s = pixels.d, layer.s
-    t = _once(1.0 / jnp.maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
+    t = edges.once(1.0 / jnp.maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
     scaled = t * layer.texture.frequency
 
     def step(change: Vector) -> Vector:
@@ -389,12 +291,6 @@ def _shade(handedness: Array, eye: Array, pixels: Rays, layer: Layer, bands: int
 
 def _times(factor: Array, vector: Vector) -> Vector:
     return factor * vector[0], factor * vector[1], factor * vector[2]
-
-
-def _once(quotient: Array) -> Array:
-    """Give a division a single user, a bound that is never reached: XLA would not fuse it into several, nor anything
-    before it, and write them all to memory."""
-    return jnp.minimum(quotient, 1e30)
 
 
 def choose(condition: Array, a: Arrays, b: Arrays) -> Arrays:

@@ -1,7 +1,7 @@
 """Many frames, many robots: the one place that scans, maps and jits a walk.
 
 `walk` is a `lax.scan` of `simulation.step`, `advance` runs it for a batch of rooms, and `chunks` does so for a few
-seconds of robot time at once, that a host can show progress, write what came, and be interrupted between two.
+seconds of robot time at once, so that a host can show progress, write what came, and be interrupted between two.
 
 The robots of a batch are dealt out to the devices. A core of a CPU is one if `JAX_NUM_CPU_DEVICES` says so before JAX
 starts, as the command line does: a body is many small sums in a row, which cores cannot share, but robots are apart.
@@ -63,16 +63,20 @@ def advance(
 
 
 def deal(one: Callable[..., Any], *batches: Any) -> Any:
-    """Map a function of one robot over batches of robots, dealt out to as many devices as share them evenly.
-
-    Each gets two or more, since a batch of one is compiled differently, and comes to other last bits.
-    """
-    robots = jax.tree.leaves(batches)[0].shape[0]
-    counts = [n for n in range(1, jax.local_device_count() + 1) if robots % n == 0 and robots > n]
-    count = max(counts, default=1)
-    mesh, each = Mesh(np.asarray(jax.local_devices()[:count]), ("robots",)), PartitionSpec("robots")
+    """Map a function of one robot over batches of robots, dealt out to their `devices`."""
+    mesh = Mesh(np.asarray(devices(jax.tree.leaves(batches)[0].shape[0])), ("robots",))
+    each = PartitionSpec("robots")
     # Unchecked: nothing passes between robots, and MJX starts its loops with constants, which the check refuses.
     return jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
+
+
+def devices(robots: int) -> list[jax.Device]:
+    """List those that a crowd is dealt out to: as many as share it evenly, two robots or more to each.
+
+    A batch of one would be compiled differently, and come to other last bits.
+    """
+    counts = [n for n in range(1, jax.local_device_count() + 1) if robots % n == 0 and robots > n]
+    return jax.local_devices()[: max(counts, default=1)]
 
 
 def chunks(

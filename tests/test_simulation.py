@@ -149,3 +149,9 @@ def test_chunks_of_a_crowd_are_one_walk(params, model):
     state = simulation.init(crowd, model, one, drivers.ANYONE)
     _, alone = jax.jit(lambda s: rollout.walk(crowd, model, one, s, drivers.ANYONE, 30, False))(state)
     np.testing.assert_allclose(short.position[3], alone.position, atol=1e-8)
+
+
+@pytest.mark.parametrize(("robots", "shares"), [(1, 1), (2, 1), (3, 1), (4, 2), (6, 2), (7, 1)])
+def test_crowds_are_dealt_out_evenly_and_no_robot_is_alone_on_a_device(robots, shares):
+    assert jax.local_device_count() == 2
+    assert len(rollout.devices(robots)) == shares
