@@ -46,7 +46,7 @@ def measure(params: simulation.Params, robots: int) -> tuple[float, float]:
     fixed = {"driver": drivers.TEACHER, "frames": FRAMES}
     compiled = rollout.advance.lower(params, model, rooms, states, draw=jnp.asarray(True), **fixed).compile()
     analysis = compiled.memory_analysis()
-    share = robots / len(rollout.devices(robots))
+    share = robots / rollout.shares(robots)
     memory = analysis.temp_size_in_bytes / 1e6 / share if analysis else math.nan  # not every device tells
     seconds = []
     for _ in range(REPEATS + 1):  # the first is thrown away

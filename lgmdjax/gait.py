@@ -254,7 +254,7 @@ def _trunk(gait: Gait) -> Float[np.ndarray, "6 9"]:
 @partial(jax.vmap, in_axes=(None, None, 0))
 @partial(jax.vmap, in_axes=(None, 2, 0))
 def _starts(inputs: Float[Array, "p v 3"], targets: Float[Array, "p v 3"], key: Array) -> _Networks:
-    """Draw networks, (candidates, legs): units that bend at random points of the lesson, and the output layer that fits best."""
+    """Draw networks (candidates, legs): units that bend at random points of the lesson, the output layer that fits."""
     x, y = inputs.reshape(-1, 3), targets.reshape(-1, 3)
     first, second = jax.random.split(key)
     w1 = jax.random.normal(first, (3, shaping.UNITS), dtype=float)

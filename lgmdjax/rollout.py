@@ -63,20 +63,21 @@ def advance(
 
 
 def deal(one: Callable[..., Any], *batches: Any) -> Any:
-    """Map a function of one robot over batches of robots, dealt out to their `devices`."""
-    mesh = Mesh(np.asarray(devices(jax.tree.leaves(batches)[0].shape[0])), ("robots",))
+    """Map a function of one robot over batches of robots, dealt out to `shares` devices."""
+    robots = jax.tree.leaves(batches)[0].shape[0]
+    mesh = Mesh(np.asarray(jax.local_devices()[: shares(robots)]), ("robots",))
     each = PartitionSpec("robots")
     # Unchecked: nothing passes between robots, and MJX starts its loops with constants, which the check refuses.
     return jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
 
 
-def devices(robots: int) -> list[jax.Device]:
-    """List those that a crowd is dealt out to: as many as share it evenly, two robots or more to each.
+def shares(robots: int) -> int:
+    """Count the devices that a crowd is dealt out to: as many as share it evenly, two robots or more to each.
 
     A batch of one would be compiled differently, and come to other last bits.
     """
-    counts = [n for n in range(1, jax.local_device_count() + 1) if robots % n == 0 and robots > n]
-    return jax.local_devices()[: max(counts, default=1)]
+    even = [n for n in range(1, jax.local_device_count() + 1) if robots % n == 0 and robots > n]
+    return max(even, default=1)
 
 
 def chunks(

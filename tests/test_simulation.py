@@ -154,4 +154,4 @@ def test_chunks_of_a_crowd_are_one_walk(params, model):
 @pytest.mark.parametrize(("robots", "shares"), [(1, 1), (2, 1), (3, 1), (4, 2), (6, 2), (7, 1)])
 def test_crowds_are_dealt_out_evenly_and_no_robot_is_alone_on_a_device(robots, shares):
     assert jax.local_device_count() == 2
-    assert len(rollout.devices(robots)) == shares
+    assert rollout.shares(robots) == shares
