@@ -19,6 +19,11 @@ wall it walks on, faster and faster, because both sides are equally near. `step`
 twice: it keeps to the gait's range in the way that saves most of the turn (`limit`), and when something is
 near it turns at least so much, and goes on turning the way it turns while both sides are nearly equally near.
 
+Tuned until 16 robots, a minute each in `scenes.training_room`, touched nothing in 58 m and came no nearer than 0.14 m
+(`tests/test_teacher.py` does it with eight); there eq. 22 within the gait's range touched something 17 times in 66 m,
+and a blind robot 20 times in 58 m. It is `full_turn` that keeps the robot off; the tie-break, without which nothing
+was touched there either, makes the labels ones that can be learned: the same sight, the same turn.
+
 Gradient: exact almost everywhere; the side of the turn has none.
 """
 
@@ -29,6 +34,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
+from lgmdjax.shaping import FASTEST, SLOWEST
 
 Scalar = Float[Array, ""] | float
 
@@ -46,8 +52,8 @@ class Params:
     base: Scalar = 1.2  # v_base; the paper's "1.2 m/s" is 1.2 times nominal
     gain_2a: Scalar = 0.8  # k_2a
     gain_3b: Scalar = 0.6  # k_3b
-    slowest: Scalar = -1.0  # the gait's range
-    fastest: Scalar = 2.0
+    slowest: Scalar = SLOWEST  # the gait's range
+    fastest: Scalar = FASTEST
     near: Scalar = 0.8  # m; nearer than this, it turns at least a part of full_turn
     close: Scalar = 0.5  # m; nearer than this, at least all of it
     full_turn: Scalar = 3.0  # |v_right - v_left|; the range's width is the most there is

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
 
 from lgmdjax.errors import InputError
@@ -47,13 +49,15 @@ class Checkpoints:
             tag = ocp.args.Composite(belongs=ocp.args.JsonRestore())  # pyright: ignore
             self._require_own(self.manager.restore(step, args=tag)["belongs"])
             wanted = ocp.args.Composite(progress=ocp.args.StandardRestore(template))  # pyright: ignore
-            return self.manager.restore(step, args=wanted)["progress"]
+            restored = self.manager.restore(step, args=wanted)["progress"]
         except InputError:
             raise
         except Exception as error:  # orbax raises whatever its storage layer does
             raise InputError(
                 f"{self.folder}: expected a whole checkpoint, got {_line(error)}; remove it to start again"
             ) from error
+        # Orbax ties them to a device, and what is tied to one cannot meet a crowd that is dealt out to several.
+        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), restored)
 
     def save(self, step: int, progress: Any) -> None:
         """Write progress; it is complete on disk when this returns."""

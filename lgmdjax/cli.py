@@ -72,7 +72,6 @@ def doctor(*, out: Path = Path("runs")) -> int:
     Args:
         out: the folder that runs would be written to
     """
-    _import_physics()
     from lgmdjax.doctor import examine
 
     return examine(out)
@@ -155,7 +154,7 @@ def _execute(pipeline: Pipeline, target: str) -> Path:
 
     name = pipeline.name or f"{pipeline.scale}-{pipeline.seed}"
     run = open_run(pipeline.out, name, pipeline.scale, pipeline.seed, SCALES[pipeline.scale])
-    _import_physics()
+    import_physics()
     return execute(run, STAGES, target)
 
 
@@ -170,7 +169,7 @@ def _prepare_jax() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-def _import_physics() -> None:
+def import_physics() -> None:
     """Import MJX without the lines that it prints about an optional back end."""
     with contextlib.redirect_stdout(io.StringIO()):
         import mujoco.mjx  # noqa: F401

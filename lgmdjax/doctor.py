@@ -10,8 +10,6 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from packaging.requirements import Requirement
 
@@ -86,6 +84,8 @@ def packages() -> Finding:
 
 def devices() -> Finding:
     """Name what JAX computes on, and whether a GPU lies idle."""
+    import jax  # here and below: what cannot be imported is a finding
+
     found = jax.devices()
     text = ", ".join(str(device.device_kind) for device in found) + f"; {os.cpu_count()} cores"
     if found[0].platform == "cpu" and shutil.which("nvidia-smi"):
@@ -95,6 +95,9 @@ def devices() -> Finding:
 
 def arithmetic() -> Finding:
     """Run the smallest program that some releases of JAX compile to wrong numbers (jax#39103)."""
+    import jax
+    import jax.numpy as jnp
+
     with jax.enable_x64(True):
         rows = np.random.default_rng(0).normal(size=(CANARY_ROWS, 3))
         squares = jax.jit(jax.vmap(lambda row: jnp.sum((jnp.eye(3) @ row) ** 2)))(rows)
@@ -109,7 +112,13 @@ def arithmetic() -> Finding:
 
 def physics() -> Finding:
     """Take one step with the kicked hexapod in MJX and in C MuJoCo."""
+    import jax
+    import jax.numpy as jnp
     import mujoco
+
+    from lgmdjax.cli import import_physics
+
+    import_physics()
     from mujoco import mjx
 
     from lgmdjax import hexapod

@@ -23,6 +23,8 @@ from jaxtyping import Array, Float, Int
 
 from lgmdjax import braitenberg, navigator
 
+RANGE = braitenberg.Params()  # its limits are what the legs can do, whoever drives
+
 
 @struct.dataclass(kw_only=True)
 class Senses:
@@ -70,7 +72,7 @@ def _step_teacher(params: braitenberg.Params, state: braitenberg.State, senses: 
 
 def _step_learned(params: navigator.Params, state: navigator.State, senses: Senses):
     state, asked = navigator.step(params, state, senses.u)
-    velocity = braitenberg.limit(braitenberg.Params(), asked)
+    velocity = braitenberg.limit(RANGE, asked)
     return replace(state, velocity=velocity), velocity  # what was done, not what was asked, is its next input
 
 

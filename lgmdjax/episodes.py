@@ -24,7 +24,6 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float, Int
 
+from lgmdjax import versions
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import Record
 
@@ -143,13 +143,12 @@ class Writer:
 
     def _metadata(self) -> dict[str, str]:
         units = {column: field.unit for field in FIELDS.values() for column in field.columns if field.unit}
-        versions = {package: version(package) for package in ("jax", "mujoco", "pyarrow")}
         header = {
             "format": FORMAT,
             "version": VERSION,
             "units": units,
             "parameters": self.parameters,
-            "versions": versions,
+            "versions": versions.installed(),
         }
         return {"lgmdjax": json.dumps(header)}
 

@@ -11,7 +11,7 @@ thing: the functions share a style and nothing else.
 | `foot_paths`   | 5c           | path of leg 1's foot, commanded and simulated           |
 | `gait_sweep`   | -            | speed and turning asked for and walked                  |
 | `layers`       | 6b           | picture, E, I and S of one eye                          |
-| `calibration`  | -            | score of the candidates for T_s, T_f, W_I               |
+| `calibration`  | -            | score of the candidates for T_s and W_I                 |
 | `losses`       | 11           | training and test error of every learner                |
 | `stretch`      | 12           | u, d, the rule's v and the learner's v side by side     |
 | `trajectories` | 13           | walks in a room, with its obstacles                     |
@@ -183,7 +183,7 @@ def _side_view(axes: Axes, path: Float[ndarray, "steps 3"], **style: Any) -> Non
 
 
 @styled
-def gait_sweep(sweep: Sequence[Mapping[str, Any]], literal: Mapping[str, float], nominal: float = 0.05) -> Figure:
+def gait_sweep(sweep: Sequence[Mapping[str, Any]], literal: Mapping[str, float], nominal: float) -> Figure:
     """Draw the speed asked for beside the speeds walked, and the turning rate over v_r - v_l.
 
     Args:
@@ -246,26 +246,21 @@ def layers(
 
 @styled
 def calibration(table: Sequence[Mapping[str, float]], chosen: Mapping[str, float]) -> Figure:
-    """Draw the score of every candidate against its threshold T_s, a line for each of the other settings.
+    """Draw the score of every candidate against its threshold T_s, a line for each weight W_I.
 
     Args:
-        table: rows with "threshold" [grey], "score", whatever else was varied, and perhaps the "left" and "right"
-            correlations beside the score.
+        table: rows with "threshold" [grey], "inhibition" and "score".
         chosen: the settings that were kept, "threshold" among them.
     """
     figure = Figure(figsize=(WIDTH, 2.7))
     axes = figure.subplots()
-    varied = [name for name in ("overlap", "inhibition", "suppression") if _varies(table, name)]
-    groups: dict[tuple, list[Mapping[str, float]]] = {}
+    weights: dict[float, list[Mapping[str, float]]] = {}
     for row in sorted(table, key=lambda row: row["threshold"]):
-        groups.setdefault(tuple(row.get(name) for name in varied), []).append(row)
-    shades = colormaps["viridis"](np.linspace(0, 0.9, len(groups)))
-    for shade, (values, rows) in zip(shades, groups.items(), strict=True):
-        label = ", ".join(f"{name} {value:.3g}" for name, value in zip(varied, values, strict=True))
-        _candidates(axes, rows, "score", color=shade, marker="o", markersize=4, label=label or "left minus right")
-        for side, colour in (("left", LEFT), ("right", RIGHT)):
-            if side in rows[0] and not varied:
-                _candidates(axes, rows, side, color=colour, linewidth=1, label=f"{side} alone")
+        weights.setdefault(row["inhibition"], []).append(row)
+    shades = colormaps["viridis"](np.linspace(0, 0.9, len(weights)))
+    for shade, (weight, rows) in zip(shades, weights.items(), strict=True):
+        thresholds, scores = zip(*((row["threshold"], row["score"]) for row in rows), strict=True)
+        axes.plot(thresholds, scores, color=shade, marker="o", markersize=4, label=f"W_I = {weight:.3g}")
     axes.axvline(chosen["threshold"], color=ALARM, linewidth=1.2, linestyle="--", label="chosen T_s")
     axes.set(xlabel="threshold T_s [grey levels]", ylabel="correlation [1]")
     if min(row["threshold"] for row in table) > 0:
@@ -275,14 +270,6 @@ def calibration(table: Sequence[Mapping[str, float]], chosen: Mapping[str, float
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
-
-
-def _candidates(axes: Axes, rows: Sequence[Mapping[str, float]], column: str, **style: Any) -> None:
-    axes.plot([row["threshold"] for row in rows], [row[column] for row in rows], **style)
-
-
-def _varies(table: Sequence[Mapping[str, float]], name: str) -> bool:
-    return len({row.get(name) for row in table}) > 1
 
 
 @styled

@@ -30,10 +30,10 @@ from scipy import ndimage
 from lgmdjax import arena, camera, hexapod, outside, video
 from lgmdjax.errors import InputError
 from lgmdjax.figures import FAINT, INK, LEFT, RIGHT, STYLE
+from lgmdjax.simulation import FRAME_RATE
 
 RATE = 12  # pictures a second
-STRIDE = 5  # recorded frames from one picture to the next
-FRAME_RATE = 30.0  # Hz, of the record
+STRIDE = round(2 * FRAME_RATE / RATE)  # recorded frames from one picture to the next: twice as fast as life
 SIZE = (960, 600)  # px, width and height of the film
 STAGE = (8, 28, 624, 390)  # px: left, top, width, height of the view from outside
 EYES = ((640, 28, 312, 234), (640, 294, 312, 234))
@@ -131,7 +131,7 @@ def _shots(walk: Walk, rows: ndarray) -> tuple[_Shots, outside.Body]:
     forward = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)[rows]
     target = position[rows]
     eye = target - BEHIND * forward + np.array([0, 0, ABOVE])
-    starts, ends, positions, rotations, radii, colours = bodies(walk, rows)
+    starts, ends, positions, rotations, radii, colours = bodies(poses(walk, rows))
     single = partial(jnp.asarray, dtype=jnp.float32)
     shots = _Shots(
         *map(
@@ -170,12 +170,18 @@ def looking(eye: Float[ndarray, "n 3"], at: Float[ndarray, "n 3"]) -> Float[ndar
     return np.stack([forward, left, np.cross(forward, left)], axis=-1)
 
 
-def bodies(walk: Walk, rows: ndarray) -> tuple[ndarray, ...]:
-    """Find the robot's visible capsules and its eyes, by C MuJoCo's kinematics.
+def poses(walk: Walk, rows: ndarray) -> Float[ndarray, "n 25"]:
+    """Put the chosen frames of a walk into the model's coordinates (qpos)."""
+    joints = walk.joints[rows].reshape(len(rows), -1)
+    return np.concatenate([walk.position[rows], walk.quaternion[rows], joints], axis=1)
+
+
+def bodies(qpos: Float[ndarray, "n 25"]) -> tuple[ndarray, ...]:
+    """Find the robot's visible capsules and its eyes in so many poses, by C MuJoCo's kinematics.
 
     Returns:
         The capsules' two ends (n, k, 3), the eyes' positions (n, 2, 3) and rotations (n, 2, 3, 3); the same
-        for all pictures, the radii (k,) and colours (k, 3).
+        for all poses, the radii (k,) and colours (k, 3).
     """
     model = hexapod.load()
     data = mujoco.MjData(model)
@@ -183,8 +189,8 @@ def bodies(walk: Walk, rows: ndarray) -> tuple[ndarray, ...]:
     sites = [model.site(name).id for name in hexapod.EYES]
     half_length = np.where(model.geom_type[seen] == mujoco.mjtGeom.mjGEOM_CAPSULE, model.geom_size[seen, 1], 0.0)
     found = []
-    for row in rows:
-        data.qpos[:] = np.concatenate([walk.position[row], walk.quaternion[row], walk.joints[row].ravel()])
+    for pose in qpos:
+        data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
         reach = data.geom_xmat[seen].reshape(-1, 3, 3)[..., 2] * half_length[:, None]
         centres, turned = data.geom_xpos[seen], data.site_xmat[sites].reshape(2, 3, 3)

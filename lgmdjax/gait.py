@@ -35,8 +35,6 @@ from lgmdjax.legs import forward as forward
 from lgmdjax.legs import geometry as geometry
 from lgmdjax.legs import inverse as inverse
 
-SLOWEST, FASTEST = -1.0, 2.0  # the range of velocities that the networks are taught
-
 # The lesson: velocities and how much each counts; walking backward is for turning and needs no accuracy.
 VELOCITIES = (-1.0, -0.6, -0.2, 0.2, 0.5, 0.8, 1.0, 1.2, 1.4, 1.7, 2.0)
 IMPORTANCE = (0.5, 0.5, 0.5, 0.7, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
@@ -55,8 +53,8 @@ class Gait:
 
     The feet stand closer in than the Mark II's (0.14 m from the coxa). There a sideways push on a foot hardly
     raises or lowers it, and front and rear feet drag less when the robot turns: on the spot at 0.19 rad/s
-    instead of 0.14, with 0.02 degrees RMS of pitch instead of 0.16. The robot is 0.40 m wide then, as the
-    paper's.
+    instead of 0.14, with 0.02 degrees RMS of pitch instead of 0.16. The feet's centres are then 0.40 m apart at
+    the widest; the paper's robot is 0.40 m wide.
     """
 
     nominal_velocity: Scalar = 0.05  # m/s at v = 1

@@ -189,8 +189,9 @@ def substep(model: mjx.Model, data: mjx.Data, targets: Float[Array, "6 3"]) -> m
 def place_obstacles(model: mjx.Model, room: arena.Arena, pose: Pose) -> mjx.Model:
     """Move the obstacle slots of trunk and legs to the box, walls among them, and the cylinder nearest to each.
 
-    Legs are taken as they stand, from hip to foot. A cylinder is a capsule whose caps reach beyond its ends: into the
-    floor, and above the robot. What hangs overhead is put aside.
+    Legs are taken as they stand, from hip to foot. Of two boxes that a part would touch at once, as the walls of a
+    corner, it knows the nearer one only. A cylinder is a capsule whose caps reach beyond its ends: into the floor,
+    and above the robot. What hangs overhead is put aside.
     """
     slots = _anatomy()
     starts, ends = pose.position + slots.reach.astype(pose.position.dtype) @ rotation(pose).T

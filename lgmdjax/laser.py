@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from lgmdjax import raycast
 from lgmdjax.arena import Arena
+from lgmdjax.errors import InputError
 
 
 @struct.dataclass(kw_only=True)
@@ -26,6 +27,15 @@ class Params:
     rays: int = struct.field(pytree_node=False, default=341)
     field_of_view: float = math.radians(170.0)
     clip: float = 5.0
+
+
+def check(params: Params) -> None:
+    """Raise `InputError` for a scanner that sees nothing."""
+    if params.rays < 2:
+        raise InputError(f"laser rays: expected 2 or more, got {params.rays}; the paper has 341")
+    for name, most in (("field_of_view", 2 * math.pi), ("clip", math.inf)):
+        if not 0 < (value := float(getattr(params, name))) <= most or math.isinf(value):
+            raise InputError(f"laser {name}: expected a positive number up to {most:.3g}, got {value}")
 
 
 def bearings(params: Params) -> Float[Array, " rays"]:

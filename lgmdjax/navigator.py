@@ -27,7 +27,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -39,6 +38,7 @@ from jaxtyping import Array, Float
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from lgmdjax import versions
 from lgmdjax.errors import InputError
 
 Variant = Literal["lstm", "lstm-efference", "feed-forward", "mean"]
@@ -141,8 +141,7 @@ def save(path: Path | str, params: Params, metadata: Mapping[str, Any] | None = 
     tensors = {name: np.asarray(value) for name, value in _tensors(params).items()}
     if not all(np.isfinite(value).all() for value in tensors.values()):
         raise InputError(f"{path}: expected finite weights to save, got some that are not; train again")
-    versions = {package: version(package) for package in ("jax", "flax", "numpy")}
-    header = {"variant": params.variant, "units": params.units, "versions": versions, **(metadata or {})}
+    header = {"variant": params.variant, "units": params.units, "versions": versions.installed(), **(metadata or {})}
     text = {"format": FORMAT, "version": VERSION} | {name: json.dumps(x) for name, x in header.items()}
     partial = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:

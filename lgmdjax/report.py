@@ -6,20 +6,18 @@ written into the page itself, so that it works offline. The page appears whole o
 | section       | made from                                                                   |
 | ------------- | --------------------------------------------------------------------------- |
 | result, film  | evaluate/evaluation.json, evaluate/walk.npz                                 |
-| legs          | gait/gait.json, gait/cpg.npz, gait/foot.npz                                 |
+| legs          | fit-gait/gait.json, fit-gait/cpg.npz, fit-gait/foot.npz                     |
 | eyes          | evaluate/layers.npz, collect/calibration.json                               |
 | learning      | train/training.json, train/prediction.npz                                   |
 | walking       | evaluate/evaluation.json, evaluate/trajectories.npz                         |
-| how made      | run.json, the stages' done.json                                             |
+| how made      | run.json, the done.json of each stage                                       |
 """
 
 import base64
 import io
-import json
 import math
 import os
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +25,14 @@ import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
-from lgmdjax import arena, camera, figures, film, scenes
+from lgmdjax import arena, camera, figures, film, hexapod, scenes
 from lgmdjax.errors import InputError
+from lgmdjax.gait import Gait
+from lgmdjax.runs import read_arrays, read_json
 
 MINUS = "\N{MINUS SIGN}"
-NOMINAL = 0.05  # m/s, the speed at v = 1
-STAGES = {"gait": "fit-gait", "collect": "collect", "train": "train", "evaluate": "evaluate"}
-"""Folder of a stage's files -> the command that makes them; a folder may also have the command's name."""
+NOMINAL = float(Gait().nominal_velocity)  # m/s, the speed at v = 1
+STAGES = ("fit-gait", "collect", "train", "evaluate")  # the folders of their files, and the commands that make them
 PLACES = {"testing": "the testing room", "unseen": "random rooms never seen"}
 LOOKS_AT = {
     "teacher": "laser scanner",
@@ -88,10 +87,11 @@ def render(
 
 def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, Any]:
     """Gather everything that the template names."""
-    facts = read_json(run, "run.json")
-    gait, evaluation = read_json(run, "gait/gait.json"), read_json(run, "evaluate/evaluation.json")
-    training, calibration = read_json(run, "train/training.json"), read_json(run, "collect/calibration.json")
-    rhythm = read_arrays(run, "gait/cpg.npz")
+    facts = read_json(run / "run.json")
+    gait, evaluation = read_json(run / "fit-gait/gait.json"), read_json(run / "evaluate/evaluation.json")
+    training, calibration = read_json(run / "train/training.json"), read_json(run / "collect/calibration.json")
+    rhythm = read_arrays(run / "fit-gait/cpg.npz")
+    stages = [{"name": stage, **read_json(run / f"{stage}/done.json")} for stage in STAGES]
     eyes = camera.Params(**{name: facts["settings"]["evaluate"]["eyes"][name] for name in ("width", "height")})
     drawn = {
         **_gait_figures(run, gait, rhythm),
@@ -103,7 +103,7 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "figures": {name: _inline_svg(figure) for name, figure in drawn.items()},
         "film": _film(run, eyes, calibration, room, video_seconds),
         "eyes": eyes,
-        "layers_size": list(reversed(read_arrays(run, "evaluate/layers.npz")["picture"].shape)),
+        "layers_size": list(reversed(read_arrays(run / "evaluate/layers.npz")["picture"].shape)),
         "rounds": facts["settings"]["train"].get("rounds", 0),
         "facts": facts,
         "gait": gait,
@@ -112,7 +112,9 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "training": training,
         "evaluation": evaluation,
         "verdicts": {place: verdict(scores) for place, scores in evaluation.items()},
-        "stages": _stages(run),
+        "stages": stages,
+        "versions": versions(stages),
+        "size": _size(),
         "places": PLACES,
         "looks_at": LOOKS_AT,
         "learners": LEARNERS,
@@ -131,45 +133,22 @@ def verdict(scores: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def read_json(run: Path, name: str) -> Any:
-    """Read a JSON file of the run folder."""
-    path = _find(run, name)
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise _unreadable(path, name, error) from error
-
-
-def read_arrays(run: Path, name: str) -> dict[str, np.ndarray]:
-    """Read all arrays of an npz file of the run folder."""
-    path = _find(run, name)
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {key: arrays[key] for key in arrays.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise _unreadable(path, name, error) from error
-
-
-def _find(run: Path, name: str) -> Path:
-    """Find a file, in the folder named in the table above or in one named after the command that makes it."""
-    folder, _, rest = name.rpartition("/")
-    command = STAGES.get(folder, "reproduce")
-    for place in (run / name, run / command / rest):
-        if place.is_file():
-            return place
-    raise InputError(f"expected {name} in {run}, found none; run `lgmdjax {command}` first")
-
-
-def _unreadable(path: Path, name: str, error: Exception) -> InputError:
-    command = STAGES.get(name.rpartition("/")[0], "reproduce")
-    return InputError(
-        f"expected {path} as `lgmdjax {command}` writes it, got a file that cannot be read ({error}); "
-        f"delete its folder and run `lgmdjax {command}` again"
-    )
+def versions(stages: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Name the version of each package that the stages ran with; where they differ, all of them with their stages."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for stage in stages:
+        for package, version in stage["versions"].items():
+            found.setdefault(package, {}).setdefault(version, []).append(stage["name"])
+    return {
+        package: "; ".join(f"{version} ({', '.join(names)})" for version, names in users.items())
+        if len(users) > 1
+        else next(iter(users))
+        for package, users in found.items()
+    }
 
 
 def _gait_figures(run: Path, gait: Mapping[str, Any], rhythm: Numbers) -> dict[str, Figure]:
-    foot = read_arrays(run, "gait/foot.npz")
+    foot = read_arrays(run / "fit-gait/foot.npz")
     period, cycles = float(rhythm["period"]), float(rhythm["transient_cycles"])
     return {
         "rhythm": figures.rhythm(rhythm["time"], rhythm["rhythm"], period, cycles),
@@ -179,7 +158,7 @@ def _gait_figures(run: Path, gait: Mapping[str, Any], rhythm: Numbers) -> dict[s
 
 
 def _eye_figures(run: Path, calibration: Mapping[str, Any]) -> dict[str, Figure]:
-    seen = read_arrays(run, "evaluate/layers.npz")
+    seen = read_arrays(run / "evaluate/layers.npz")
     return {
         "layers": figures.layers(seen["picture"], seen["E"], seen["I"], seen["S"]),
         "calibration": figures.calibration(calibration["table"], calibration),
@@ -187,13 +166,13 @@ def _eye_figures(run: Path, calibration: Mapping[str, Any]) -> dict[str, Figure]
 
 
 def _learning_figures(run: Path, training: Mapping[str, Any]) -> dict[str, Figure]:
-    seen = read_arrays(run, "train/prediction.npz")
+    seen = read_arrays(run / "train/prediction.npz")
     series = (seen[name] for name in ("time", "u", "distances", "label", "predicted"))
     return {"losses": figures.losses(training["curves"], LEARNERS), "stretch": figures.stretch(*series)}
 
 
 def _walking_figures(run: Path, evaluation: Mapping[str, Any], room: arena.Arena) -> dict[str, Figure]:
-    paths = read_arrays(run, "evaluate/trajectories.npz")
+    paths = read_arrays(run / "evaluate/trajectories.npz")
     walks = {
         name: figures.Walks(*(paths[f"testing_{name}{part}"] for part in ("", "_setbacks", "_contact")))
         for name in evaluation["testing"]
@@ -204,22 +183,19 @@ def _walking_figures(run: Path, evaluation: Mapping[str, Any], room: arena.Arena
 
 def _film(run: Path, eyes: camera.Params, calibration: Mapping[str, Any], room: arena.Arena, seconds: float) -> str:
     """Draw the film of the learned controller's walk, its eyes as fine as they were; give a data address."""
-    recorded = read_arrays(run, "evaluate/walk.npz")
+    recorded = read_arrays(run / "evaluate/walk.npz")
     walk = film.Walk(*(recorded[name] for name in film.Walk._fields))
     buffer = io.BytesIO()
     film.write(buffer, walk, room, eyes, seconds, float(calibration["overlap"]))
     return _inline("video/mp4", buffer.getvalue())
 
 
-def _stages(run: Path) -> list[dict[str, Any]]:
-    """Read how long each stage took and on what, where the stages left word of it."""
-    found = []
-    for folder, command in STAGES.items():
-        for path in (run / folder / "done.json", run / command / "done.json", run / f"{folder}.done.json"):
-            if path.is_file():
-                found.append({"name": command, **json.loads(path.read_text(encoding="utf-8"))})
-                break
-    return found
+def _size() -> dict[str, float]:
+    """Measure how long and how wide is what can be seen of the robot when it stands [m]."""
+    starts, ends, _, _, radii, _ = film.bodies(hexapod.load().key("stance").qpos[None])
+    tips, thick = np.stack([starts[0], ends[0]]), radii[:, None]
+    length, width, _ = np.max(tips + thick, axis=(0, 1)) - np.min(tips - thick, axis=(0, 1))
+    return {"length": float(length), "width": float(width)}
 
 
 def _environment() -> jinja2.Environment:

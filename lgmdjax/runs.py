@@ -5,8 +5,8 @@
     runs/<name>/<stage>/                   its files, moved here in one step once all of them are written
     runs/<name>/<stage>/done.json          its fingerprint, files, seconds of the last try, versions, device
 
-The fingerprint of a stage covers its settings, the seed, the version of its format and the fingerprints of
-its inputs: a stage whose folder carries the fingerprint that it would get now has nothing to do.
+The fingerprint of a stage covers its settings, the seed, the versions of its format and of lgmdjax, and the
+fingerprints of its inputs: a stage whose folder carries the fingerprint that it would get now has nothing to do.
 """
 
 import contextlib
@@ -15,19 +15,20 @@ import hashlib
 import json
 import os
 import shutil
-import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from lgmdjax import __version__
+import numpy as np
+
+from lgmdjax import __version__, versions
 from lgmdjax.errors import InputError
 
 FORMAT = 1  # of the run folder; a change makes every stage of an older folder run again
-PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx")
+SEEDS = 2**32  # in single precision JAX keeps no more of a seed: greater ones would be other ones' twins
 
 # Writes its files into the folder (first argument), which may hold what an interrupted try left there; reads
 # the finished folders of its input stages, by their names; gets its own settings and the run's seed.
@@ -53,17 +54,6 @@ class Run:
     settings: Mapping[str, Any]
 
 
-def versions() -> dict[str, str]:
-    """Name the versions that a result depends on; 'missing' where a package is not installed."""
-    found = {"python": sys.version.split()[0], "lgmdjax": __version__}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "missing"
-    return found
-
-
 def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str, Any]) -> Run:
     """Make the run folder out/name, or take up the one that is there.
 
@@ -71,8 +61,8 @@ def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str,
     """
     if name in ("", ".", "..") or Path(name).name != name:
         raise InputError(f"expected a plain folder name for the run, got {name!r}; use --out for the path")
-    if seed < 0:
-        raise InputError(f"expected a seed of 0 or more, got {seed}; choose another --seed")
+    if not 0 <= seed < SEEDS:
+        raise InputError(f"expected a seed of 0 to {SEEDS - 1}, got {seed}; choose another --seed")
     folder = out / name
     asked = {"format": FORMAT, "scale": scale, "seed": seed, "settings": _plain(settings)}
     try:
@@ -80,7 +70,7 @@ def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str,
         if (folder / "run.json").exists():
             _check_same(folder, asked)
         else:
-            write_json(folder / "run.json", asked | {"versions": versions()})
+            write_json(folder / "run.json", asked | {"versions": versions.installed()})
         (folder / ".lock").touch()
     except OSError as error:
         reason = error.strerror or error
@@ -112,6 +102,7 @@ def fingerprint(stage: Stage, settings: Any, seed: int, inputs: Mapping[str, str
         "format": FORMAT,
         "stage": stage.name,
         "version": stage.version,
+        "lgmdjax": __version__,
         "settings": _plain(settings),
         "seed": seed,
         "inputs": {name: inputs[name] for name in stage.inputs},
@@ -124,6 +115,34 @@ def write_json(path: Path, content: Any) -> None:
     partial = path.with_name(path.name + ".partial")
     partial.write_text(json.dumps(content, indent=2) + "\n")
     os.replace(partial, path)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file of a run folder; raise `InputError` for a missing or damaged one."""
+    with _named(path):
+        return json.loads(path.read_text(encoding="utf-8"))
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz file of a run folder; raise `InputError` for a missing or damaged one."""
+    with _named(path), np.load(path, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Tell which file could not be read, and the command that makes it."""
+    command = "reproduce" if path.name == "run.json" else path.parent.name.partition(".")[0]
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f"expected {path}, found none; run `lgmdjax {command}` first") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(
+            f"expected {path} as `lgmdjax {command}` writes it, got a file that cannot be read ({reason}); "
+            f"delete its folder and run `lgmdjax {command}` again"
+        ) from error
 
 
 def _do(run: Run, stage: Stage, print_: str) -> None:
@@ -142,7 +161,7 @@ def _do(run: Run, stage: Stage, print_: str) -> None:
         inputs = {name: run.folder / name for name in stage.inputs}
         stage.work(partial, inputs, run.settings[stage.name], run.seed)
         seconds = time.perf_counter() - began
-        stamp = {"fingerprint": print_, "seconds": round(seconds, 1), "versions": versions()}
+        stamp = {"fingerprint": print_, "seconds": round(seconds, 1), "versions": versions.installed()}
         write_json(partial / "done.json", stamp | {"device": device(), "files": _sizes(partial)})
         print(f"{stage.name}: done in {seconds:.0f} s", flush=True)
     if final.exists():
@@ -160,7 +179,7 @@ def device() -> str:
 
 
 def _announce(stage: Stage, final: Path, seed: int, *, resumed: bool) -> None:
-    found = versions()
+    found = versions.installed()
     words = ", ".join(f"{name} {found[name]}" for name in ("lgmdjax", "python", "jax", "mujoco"))
     verb = "carries on" if resumed else "starts"
     print(f"{stage.name}: {verb} on {device()}; {words}; seed {seed}; into {final}", flush=True)

@@ -88,7 +88,7 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
     },
     "paper": {
         "fit-gait": FitGait(steps=6000, seconds=20),
-        "collect": Collect(eyes=_PAPER, robots=16, episodes=1, seconds=56.25, calibration_seconds=30),
+        "collect": Collect(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
         "train": Train(eyes=_PAPER, epochs=1000, rounds=2, round_epochs=200, robots=16, round_seconds=60),
         "evaluate": Evaluate(eyes=_PAPER, robots=16, seconds=180, testing_seconds=270),
         "report": Report(video_seconds=30),

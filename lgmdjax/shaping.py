@@ -31,6 +31,7 @@ from safetensors.numpy import save as serialise
 from lgmdjax.errors import InputError
 
 LEGS, INPUTS, UNITS, JOINTS = 6, 3, 6, 3
+SLOWEST, FASTEST = -1.0, 2.0  # the range of velocities that the networks are taught, and so what the legs can do
 FORMAT, VERSION = "lgmdjax.shaping", "1"
 SHAPES = {
     "w1": (LEGS, INPUTS, UNITS),

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
@@ -96,6 +97,8 @@ def assemble(
 
     Plain numbers become arrays, so that a program compiled for some values serves all, and can be differentiated in
     them. The default networks are those that come with the package (`shaping.taught`).
+
+    Raises InputError for numbers without sense (the components' `check`), unless some are being traced.
     """
     nerves = controller.Params(
         lgmd=detector or lgmd.Params(),
@@ -109,6 +112,11 @@ def assemble(
         camera=eyes or camera.Params(),
         laser=scanner or laser.Params(),
     )
+    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
+        lgmd.check(nerves.lgmd)
+        cpg.check(nerves.cpg)
+        braitenberg.check(params.teacher)
+        laser.check(params.laser)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if np.isscalar(leaf) else leaf, params)
 
 

@@ -116,12 +116,6 @@ def poisson_rate(count: int, exposure: float) -> Estimate:
     return Estimate(value=count / exposure, low=float(low) / exposure, high=float(high) / exposure)
 
 
-def wilson(successes: int, trials: int) -> Estimate:
-    """Estimate a probability from successes in trials, with Wilson's interval."""
-    interval = stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(value=successes / trials, low=float(interval.low), high=float(interval.high))
-
-
 def bootstrap_mean(values: np.ndarray) -> Estimate:
     """Estimate a mean over robots, with a percentile bootstrap; one robot alone has no interval (nan)."""
     values = np.asarray(values)

@@ -1,6 +1,6 @@
 """`lgmdjax watch`: the two LGMDs on a video of the user's, read and written a frame at a time.
 
-Leaves, in a folder of the video's name: `response.csv` (or `.parquet`), one row a frame; `response.png`, the
+Leaves, in a folder of the video's full name: `response.csv` (or `.parquet`), one row a frame; `response.png`, the
 same as a plot; `overlay.mp4`, what the eyes see with the layers E, I and S and the course of u.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ LEAST_FRAMES = 3  # inhibition, a frame late, has not been felt before the third
 SMALLEST = 16  # px, of an eye's picture either way
 TUNED_RATE = 30  # Hz, of the robot's cameras
 SIDES = ("left", "right")
+Table = Literal["csv", "parquet"]
 UNITS = {
     "time": "s",
     "u": "1, from 0.5 (still) to 1",
@@ -55,7 +56,7 @@ def watch(
     *,
     eyes: Eyes,
     params: lgmd.Params,
-    table: Literal["csv", "parquet"] = "csv",
+    table: Table = "csv",
 ) -> list[Path]:
     """Run both detectors over a video; give the files written into out/<name of the video>/.
 
@@ -63,11 +64,12 @@ def watch(
     written.
     """
     lgmd.check(params)
+    place = out / path.name
     with video.reading(path) as film:
         width, height = _scaled(path, film, eyes)
         _note_rate(film)
         sheet = overlay.lay_out(*_split(np.zeros((height, width), np.uint8), eyes).shape[1:])
-        with _all_or_nothing(out / path.stem) as folder, _progress(film, width, height) as frames:
+        with _all_or_nothing(place) as folder, _progress(film, width, height) as frames:
             course, excitations = _look_at_all(frames, sheet, folder / "overlay.mp4", film.rate, eyes, params)
             if len(course) < LEAST_FRAMES:
                 raise InputError(
@@ -79,7 +81,9 @@ def watch(
             else:
                 pyarrow.parquet.write_table(responses, folder / "response.parquet")
             (folder / "response.png").write_bytes(figures.to_png(plot(responses, params)))
-    return [out / path.stem / name for name in (f"response.{table}", "response.png", "overlay.mp4")]
+    for other in set(get_args(Table)) - {table}:  # of an earlier time
+        (place / f"response.{other}").unlink(missing_ok=True)
+    return [place / name for name in (f"response.{table}", "response.png", "overlay.mp4")]
 
 
 @figures.styled

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from lgmdjax import arena
+from lgmdjax.simulation import FRAME_RATE
 
-FRAME_RATE = 30.0
 DRIVERS = ("teacher", "learned", "blind", "direct", "random")
 RATES = {"teacher": 0.4, "learned": 3.21, "blind": 17.3, "direct": 12.9, "random": 19.8}
 PERIOD = 1.0
@@ -67,11 +67,12 @@ def score(rate: float) -> dict:
 def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (240, 320)) -> Path:
     """Write every file that the report reads; give the folder."""
     generator = np.random.default_rng(7)
-    for name in ("gait", "collect", "train", "evaluate"):
-        (folder / name).mkdir(parents=True)
-        _json(folder / name / "done.json", {"seconds": 12.5, "device": "cpu, 2 cores"})
     versions = {"python": "3.11.9", "lgmdjax": "0.1.0", "jax": "0.9.2", "mujoco": "3.17.0"}
+    for name in ("fit-gait", "collect", "train", "evaluate"):
+        (folder / name).mkdir(parents=True)
+        _json(folder / name / "done.json", {"seconds": 12.5, "device": "cpu, 2 cores", "versions": versions})
     settings = {
+        "fit-gait": {"steps": 3000, "seconds": 25},
         "evaluate": {"eyes": {"width": 80, "height": 60}, "seconds": 60},
         "train": {"epochs": 40, "rounds": 2},
     }
@@ -79,7 +80,7 @@ def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (24
         folder / "run.json",
         {"format": 1, "scale": "quick", "seed": 4711, "settings": settings, "versions": versions},
     )
-    _write_gait(folder / "gait", generator)
+    _write_gait(folder / "fit-gait", generator)
     _write_collect(folder / "collect", generator)
     _write_train(folder / "train", generator)
     _write_evaluate(folder / "evaluate", generator, frames, pixels)
@@ -144,9 +145,7 @@ def _write_collect(folder: Path, generator: np.random.Generator) -> None:
     table = [
         {
             "threshold": t,
-            "suppression": 20.0,
             "inhibition": w,
-            "overlap": 0.6,
             "left": 0.6,
             "right": 0.5,
             "score": 0.7 - 0.02 * (t - 6 * w - 3) ** 2,
@@ -155,7 +154,7 @@ def _write_collect(folder: Path, generator: np.random.Generator) -> None:
         for t in (1.0, 2.0, 4.0, 6.0, 8.0)
     ]
     best = max(table, key=lambda row: row["score"])
-    _json(folder / "calibration.json", {**best, "table": table})
+    _json(folder / "calibration.json", {**best, "suppression": 20.0, "overlap": 0.6, "table": table})
     np.savez(folder / "rooms.npz", positions=walks(generator, 4, 900)[""][..., :2])
 
 

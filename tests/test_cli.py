@@ -37,7 +37,9 @@ def test_other_settings_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     line = fails(["reproduce", "--scale", "quick", "--name", "mine", "--out", str(tmp_path)], capsys)
     assert "scale = quick" in line and "made with smoke" in line
     assert "seed = 1" in fails(["train", "--scale=smoke", "--name=mine", f"--out={tmp_path}", "--seed=1"], capsys)
-    fails(["train", "--scale=smoke", f"--out={tmp_path}", "--seed=-1"], capsys)
+    for seed in (-1, 2**32, 10**20):
+        assert str(seed) in fails(["train", "--scale=smoke", f"--out={tmp_path / 'new'}", f"--seed={seed}"], capsys)
+    assert not (tmp_path / "new").exists()
     assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == [".lock", "run.json"]
 
 

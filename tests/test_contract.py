@@ -69,6 +69,22 @@ def open_nerves(params: controller.Params, frames: Any) -> controller.State:
     return controller.init(params, frames, drivers.LEARNED, jax.random.key(0))
 
 
+def looks(_: np.random.Generator) -> drivers.Senses:
+    """Frames quiet enough for a command within the gait's range, and so unlike that both its ends are met."""
+    u = jnp.asarray([[0.52, 0.55], [0.9, 0.55], [0.6, 0.7], [0.8, 0.85]], dtype=float)
+    nothing = jnp.zeros_like(u)
+    return drivers.Senses(u=u, feed_forward=nothing, excitation=nothing, distances=nothing)
+
+
+def driven(driver: drivers.Driver, params: Callable[[], Any], flat: tuple[str, ...] = ()) -> Component:
+    return Component(
+        driver.name, params, lambda params, _: driver.init(params, jax.random.key(4)), driver.step, looks, flat
+    )
+
+
+# `simulation` has this shape too, but is not here, since MuJoCo's step takes long to compile. Where it is compiled
+# anyway, test_simulation holds that its state can be scanned and that chunks of a crowd are one robot's walk, and
+# test_frame_gradient that reverse and forward mode agree in every parameter of the controller.
 COMPONENTS = (
     Component("lgmd", smooth, lgmd.init, lgmd.step, pictures(12, 16)),
     Component(
@@ -106,6 +122,13 @@ COMPONENTS = (
         )
         for variant in navigator.VARIANTS
     ),
+    driven(drivers.BLIND, lambda: drivers.Blind(velocity=jnp.asarray([1.2, 1.1]))),
+    driven(
+        drivers.DIRECT,
+        lambda: drivers.Direct(rule=braitenberg.Params(), gain=jnp.asarray(10.0)),
+        flat=("near", "close", "full_turn", "symmetry", "steady", "first_side"),  # the teacher's own departures
+    ),
+    driven(drivers.RANDOM, lambda: drivers.Replay(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0], [1.2, 0.9]]))),
     Component(
         "controller",
         guided,

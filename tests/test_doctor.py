@@ -1,12 +1,13 @@
 """The doctor finds nothing wrong here, and says so in one line when something is."""
 
+import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from lgmdjax import doctor, hexapod
+from lgmdjax import cli, doctor, hexapod
 from lgmdjax.errors import InputError
 
 
@@ -68,6 +69,14 @@ def test_a_failing_check_is_a_line_and_an_exit_code(
     assert [line for line in lines if line.startswith("FAIL")] == [
         "FAIL  physics     InputError: expected the robot, got nothing"
     ]
+
+
+def test_physics_that_cannot_be_imported_are_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco.mjx", None)
+    assert cli.main(["doctor", "--out", str(tmp_path)]) == 1
+    assert "FAIL  physics     ModuleNotFoundError" in capsys.readouterr().out
 
 
 def test_a_folder_that_cannot_be_written_is_found(tmp_path: Path) -> None:

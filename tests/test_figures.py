@@ -24,8 +24,8 @@ def drawn(run: Path) -> dict[str, Figure]:
     cpg, foot, layers, prediction, paths = (
         dict(np.load(run / name))
         for name in (
-            "gait/cpg.npz",
-            "gait/foot.npz",
+            "fit-gait/cpg.npz",
+            "fit-gait/foot.npz",
             "evaluate/layers.npz",
             "train/prediction.npz",
             "evaluate/trajectories.npz",
@@ -34,7 +34,7 @@ def drawn(run: Path) -> dict[str, Figure]:
     gait, calibration, training, evaluation = (
         json.loads((run / name).read_text())
         for name in (
-            "gait/gait.json",
+            "fit-gait/gait.json",
             "collect/calibration.json",
             "train/training.json",
             "evaluate/evaluation.json",
@@ -45,7 +45,7 @@ def drawn(run: Path) -> dict[str, Figure]:
         "foot_paths": figures.foot_paths(
             **{name: foot[name] for name in ("velocities", "commanded", "simulated", "literal")}
         ),
-        "gait_sweep": figures.gait_sweep(gait["sweep"], gait["literal"]),
+        "gait_sweep": figures.gait_sweep(gait["sweep"], gait["literal"], 0.05),
         "layers": figures.layers(layers["picture"], layers["E"], layers["I"], layers["S"]),
         "calibration": figures.calibration(calibration["table"], calibration),
         "losses": figures.losses(training["curves"] | {"mean": {"train": [1.0], "test": [1.1]}}, {}),
@@ -109,7 +109,7 @@ def test_matplotlib_is_left_as_it_was(run: Path):
 
 
 def test_each_tripod_has_a_panel_of_its_own(run: Path, drawn: dict[str, Figure]):
-    outputs = np.load(run / "gait/cpg.npz")["rhythm"]
+    outputs = np.load(run / "fit-gait/cpg.npz")["rhythm"]
     for tripod, legs in (("tripod 1, transient shaded", (0, 2, 4)), ("tripod 2", (1, 3, 5))):
         lines = panel(drawn["rhythm"], tripod).lines
         assert [line.get_label() for line in lines] == [figures.LEGS[leg] for leg in legs]
@@ -118,7 +118,7 @@ def test_each_tripod_has_a_panel_of_its_own(run: Path, drawn: dict[str, Figure])
 
 
 def test_foot_paths_are_seen_from_the_side_in_millimetres(run: Path, drawn: dict[str, Figure]):
-    foot = np.load(run / "gait/foot.npz")
+    foot = np.load(run / "fit-gait/foot.npz")
     simulated = panel(drawn["foot_paths"], "v = 2").lines[0]
     np.testing.assert_allclose(simulated.get_xdata(), 1000 * foot["simulated"][2, :, 0])
     np.testing.assert_allclose(simulated.get_ydata(), 1000 * foot["simulated"][2, :, 2])
@@ -141,6 +141,14 @@ def test_chosen_threshold_is_the_one_marked(run: Path, drawn: dict[str, Figure])
     chosen = json.loads((run / "collect/calibration.json").read_text())["threshold"]
     line = next(line for line in drawn["calibration"].axes[0].lines if line.get_label() == "chosen T_s")
     assert np.asarray(line.get_xdata())[0] == chosen
+
+
+def test_each_weight_has_a_line_of_scores(run: Path, drawn: dict[str, Figure]):
+    table = json.loads((run / "collect/calibration.json").read_text())["table"]
+    lines = {line.get_label(): line for line in drawn["calibration"].axes[0].lines}
+    for weight in (0.3, 0.4):
+        rows = [(row["threshold"], row["score"]) for row in table if row["inhibition"] == weight]
+        np.testing.assert_array_equal(lines[f"W_I = {weight}"].get_xydata(), rows)
 
 
 def test_losses_are_on_one_log_axis_with_the_constant_as_a_level(drawn: dict[str, Figure]):

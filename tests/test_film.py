@@ -73,7 +73,7 @@ def test_what_the_detector_does_not_see_is_dimmed(walk: film.Walk):
 
 
 def test_eyes_are_where_the_trunk_carries_them(walk: film.Walk):
-    _, _, positions, rotations, _, _ = film.bodies(walk, np.array([0, 150]))
+    _, _, positions, rotations, _, _ = film.bodies(film.poses(walk, np.array([0, 150])))
     for row, position, rotation in zip((0, 150), positions, rotations, strict=True):
         yaw = 2 * np.arctan2(walk.quaternion[row, 3], walk.quaternion[row, 0])
         forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])

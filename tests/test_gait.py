@@ -9,7 +9,7 @@ import pytest
 from lgmdjax import cpg, gait, hexapod, legs, shaping
 
 TRIPODS = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.5])
-RANGE = np.linspace(gait.SLOWEST, gait.FASTEST, 7)
+RANGE = np.linspace(shaping.SLOWEST, shaping.FASTEST, 7)
 
 
 @pytest.fixture(scope="module")

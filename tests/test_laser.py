@@ -10,6 +10,7 @@ import pytest
 from reference import arena as reference
 
 from lgmdjax import arena, laser, scenes
+from lgmdjax.errors import InputError
 
 PARAMS = laser.Params()
 scan = jax.jit(partial(laser.scan, PARAMS))
@@ -103,3 +104,10 @@ def test_the_scan_follows_the_precision(precision: str, strict: None) -> None:
     ranges = jax.eval_shape(scan, room, jnp.asarray([0.0, 0.0, 0.2]), jnp.eye(3))
     assert ranges.dtype == precision
     assert ranges.shape == (11,)
+
+
+@pytest.mark.parametrize("wrong", [{"rays": 1}, {"field_of_view": 0.0}, {"field_of_view": 7.0}, {"clip": float("nan")}])
+def test_a_scanner_that_sees_nothing_is_refused(wrong):
+    laser.check(laser.Params())
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        laser.check(laser.Params(**wrong))

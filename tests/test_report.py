@@ -130,7 +130,9 @@ def test_numbers_come_from_the_files(source: str):
         "0.0071 m/s where 0.05 is asked",
         "At v = 1 it walks 0.049 m/s where 0.05 is asked",
         "here 5 trials, 235.3 m in all, 8 collisions",
-        "60 % of the width",
+        "each cell sees 60 % of its eye",
+        "37 cm long and 45 cm wide",
+        "drift in 25 s",
     ):
         assert said in text
 
@@ -163,6 +165,24 @@ def test_the_verdict_is_what_the_intervals_say(copy: Path, learned: float, blind
     assert said in text_of(copy)
 
 
+def test_versions_are_those_of_the_stages(copy: Path):
+    rewrite(copy, "run.json", versions={"jax": "0.1.2"})
+    assert "jax0.9.2" in text_of(copy).replace(" ", "")
+    rewrite(copy, "train/done.json", versions={"jax": "0.9.9"})
+    text = text_of(copy)
+    assert "0.9.2 (fit-gait, collect, evaluate); 0.9.9 (train)" in text
+    assert "0.1.2" not in text
+
+
+def test_lost_robots_are_told_of_where_they_were_counted(copy: Path):
+    assert "lost" not in text_of(copy)
+    rewrite(copy, "collect/calibration.json", lost=0)
+    rewrite(copy, "train/training.json", lost=3)
+    text = text_of(copy)
+    assert "(none was lost)" in text
+    assert "Of the robots that walked for it, 3 were lost:" in text
+
+
 def test_a_rate_without_an_interval_has_a_dash(copy: Path):
     one = synthetic.score(3.0)
     one["clearance"] |= {"low": float("nan"), "high": float("nan")}
@@ -174,9 +194,10 @@ def test_a_rate_without_an_interval_has_a_dash(copy: Path):
     ("name", "command"),
     [
         ("run.json", "reproduce"),
-        ("gait/gait.json", "fit-gait"),
-        ("gait/foot.npz", "fit-gait"),
-        ("gait/cpg.npz", "fit-gait"),
+        ("fit-gait/gait.json", "fit-gait"),
+        ("fit-gait/foot.npz", "fit-gait"),
+        ("fit-gait/cpg.npz", "fit-gait"),
+        ("collect/done.json", "collect"),
         ("collect/calibration.json", "collect"),
         ("train/training.json", "train"),
         ("train/prediction.npz", "train"),
@@ -199,9 +220,9 @@ def test_a_missing_or_broken_file_names_the_stage_to_run(copy: Path, name: str, 
 
 
 def test_a_run_of_another_version_is_refused(copy: Path):
-    gait = json.loads((copy / "gait/gait.json").read_text())
+    gait = json.loads((copy / "fit-gait/gait.json").read_text())
     del gait["sway"]
-    (copy / "gait/gait.json").write_text(json.dumps(gait))
+    (copy / "fit-gait/gait.json").write_text(json.dumps(gait))
     with pytest.raises(InputError, match="of this version of lgmdjax"):
         report.render(copy, room=synthetic.room())
     assert not (copy / "report").exists()
@@ -217,8 +238,7 @@ def test_an_old_page_stays_when_the_new_one_fails(copy: Path):
     assert [path.name for path in page.parent.iterdir()] == ["index.html"]
 
 
-def test_folders_named_after_their_commands_are_found(copy: Path, tmp_path: Path):
-    (copy / "gait").rename(copy / "fit-gait")
+def test_the_page_can_go_elsewhere(copy: Path, tmp_path: Path):
     path = report.render(copy, tmp_path / "elsewhere", room=synthetic.room())
     assert path == tmp_path / "elsewhere" / "index.html"
     assert not (copy / "report").exists()

@@ -10,9 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lgmdjax
+from lgmdjax import runs
 from lgmdjax.errors import InputError
 from lgmdjax.runs import Run, Stage, execute, open_run
 
@@ -78,7 +80,7 @@ def test_a_finished_run_has_nothing_to_do(pipeline: Pipeline, run: Run, capsys: 
     assert pipeline.execute(run) == ["left", "right", "total"]
     assert (run.folder / "total" / "value.txt").read_text() == "21"
     began = capsys.readouterr().out
-    assert all(word in began for word in ("total: starts on cpu", "seed 5", str(run.folder), "jax"))
+    assert all(word in began for word in ("total: starts on 2 x cpu", "seed 5", str(run.folder), "jax"))
     assert pipeline.execute(run) == []
     assert capsys.readouterr().out.count("up to date") == 3
 
@@ -241,3 +243,19 @@ def test_two_processes_do_not_share_a_run_folder(run: Run) -> None:
 
     execute(run, [Stage(name="left", work=work)], "left")
     assert len(nested) == 1
+
+
+def test_damaged_files_of_a_stage_are_named(tmp_path: Path) -> None:
+    stage = tmp_path / "collect"
+    stage.mkdir()
+    (stage / "a.json").write_text('{"threshold": ')
+    np.savez(stage / "b.npz", gain=1.0)
+    assert runs.read_arrays(stage / "b.npz")["gain"] == 1.0
+    (stage / "b.npz").write_bytes((stage / "b.npz").read_bytes()[:-20])
+    for read, name, found in (
+        (runs.read_json, "a.json", "cannot be read"),
+        (runs.read_arrays, "b.npz", "cannot be read"),
+        (runs.read_json, "none.json", "none"),
+    ):
+        with pytest.raises(InputError, match=f"expected .*{name}.*{found}.*`lgmdjax collect`"):
+            read(stage / name)

@@ -115,6 +115,23 @@ def test_touch_sets_the_robot_back_at_the_next_start(walk, params, model, room):
     np.testing.assert_array_equal(record.u[1], 0.5)  # a new place is no looming
 
 
+def test_box_that_comes_is_scanned_where_it_is_and_touched_when_it_is_there(walk, params, model, room):
+    """It stands for a tenth of a second, then comes along the way ahead at 1.2 m/s."""
+    boxes = arena.place([[0.9, 0.0]], 0.2, 0.8, goal=[[0.3, 0.0]], departs=0.1, arrives=0.6)
+    scene = replace(room.arena, boxes=boxes)
+    coming = room.replace(arena=scene, starts=jnp.asarray([[0.0, 0.0, 0.0], [-1.0, 1.0, 0.5]]))
+    state = simulation.init(params, model, coming, drivers.ANYONE)
+    _, record = walk(seat(drivers.BLIND), coming, state)
+
+    touched = int(np.argmax(record.contact))
+    assert touched > 3 and not record.contact[touched + 1 :].any()
+    assert record.setbacks.tolist() == [0] * (touched + 1) + [1] * (FRAMES - touched - 1)
+    came = 1.2 * np.clip(np.asarray(record.time) - 0.1, 0, 0.5)
+    distances = np.asarray(record.distances)[: touched + 1]
+    np.testing.assert_allclose(distances[0] - distances, np.stack([came, came], axis=1)[: touched + 1], atol=0.05)
+    assert record.ok.all()
+
+
 def test_robot_that_is_not_finite_is_frozen_and_flagged_and_passes_nothing_on(walk, start, room):
     sick = start.replace(data=start.data.replace(qvel=start.data.qvel.at[7].set(jnp.nan)))
     end, record = walk(seat(drivers.BLIND), room, sick)

@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -100,6 +102,21 @@ def test_run_again_does_nothing_again(out, run):
     assert before == {path: path.stat().st_mtime_ns for path in before}
 
 
+def test_training_interrupted_before_its_own_walk_ends_the_same(run, tmp_path):
+    """The fit of the round is read back, the walk that it was to drive is walked, and all else fitted again."""
+    copy = tmp_path / "smoke"
+    shutil.copytree(run, copy)
+    fingerprint = json.loads((copy / "train" / "done.json").read_text())["fingerprint"]
+    partial = (copy / "train").rename(copy / f"train.partial-{fingerprint}")
+    for left in set(partial.iterdir()) - {partial / "checkpoints"}:
+        shutil.rmtree(left) if left.is_dir() else left.unlink()
+    done = command("train", "--scale", "smoke", "--out", str(tmp_path), "--seed", "3", "--name", "smoke")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "train: carries on" in done.stdout
+    before, after = (navigator.load(folder / "train" / "controller.safetensors")[0] for folder in (run, copy))
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+
+
 def test_other_seed_in_the_same_folder_is_refused_in_one_line(out):
     refused = command("reproduce", "--scale", "smoke", "--out", str(out), "--seed", "4", "--name", "smoke")
     assert refused.returncode == 2
@@ -110,9 +127,9 @@ def test_other_seed_in_the_same_folder_is_refused_in_one_line(out):
 def test_broken_episode_is_named_and_nothing_is_half_written(out, run, tmp_path):
     """A run whose recorded walks were damaged trains nothing."""
     copy = tmp_path / "smoke"
-    subprocess.run(["cp", "-r", str(run), str(copy)], check=True)
+    shutil.copytree(run, copy)
     for stage in ("train", "evaluate", "report"):
-        subprocess.run(["rm", "-r", str(copy / stage)], check=True)
+        shutil.rmtree(copy / stage)
     chunk = copy / "collect" / "episodes" / "chunk-00001.parquet"
     size = chunk.stat().st_size
     chunk.write_bytes(os.urandom(size))  # as long as before, so that only reading it can tell

@@ -175,6 +175,7 @@ def test_an_interrupted_fit_ends_the_same(data, tmp_path, monkeypatch):
     params, chosen = navigator.create(jax.random.key(0)), settings()
     straight = training.fit(params, train, test, chosen, show=False)
     save, saved = Checkpoints.save, []
+    monkeypatch.setattr(training, "SAVE_EVERY", 0.0)
 
     def killed(self, step, progress):
         saved.append(step)
@@ -191,6 +192,7 @@ def test_an_interrupted_fit_ends_the_same(data, tmp_path, monkeypatch):
     assert same(vars(resumed), vars(straight))
     finished = training.fit(params, train, test, chosen, checkpoints=tmp_path / "fit", show=False)
     assert same(vars(finished), vars(straight))
+    assert not any(leaf.committed for leaf in jax.tree.leaves(resumed.params))  # fit to drive on several devices
 
 
 def test_checkpoints_of_another_fit_or_damaged_ones_are_refused(data, tmp_path):

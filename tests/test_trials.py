@@ -75,14 +75,6 @@ def test_poisson_interval_matches_the_published_table(count, low, high):
     assert (estimate.low, estimate.high) == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=1e-3))
 
 
-def test_wilson_interval_matches_the_formula():
-    n, k, z = 240, 228, 1.959964
-    centre = (k + z**2 / 2) / (n + z**2)
-    half = z / (n + z**2) * np.sqrt(k * (n - k) / n + z**2 / 4)
-    estimate = trials.wilson(k, n)
-    assert (estimate.low, estimate.high) == (pytest.approx(centre - half, 1e-5), pytest.approx(centre + half, 1e-5))
-
-
 def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
     rng = np.random.default_rng(0)
     intervals = [trials.bootstrap_mean(rng.exponential(1.0, 40)) for _ in range(100)]

@@ -90,7 +90,7 @@ def test_walks_backward():
 
 
 def test_keeps_level_while_the_command_jumps_every_frame():
-    frames = jax.random.uniform(jax.random.key(7), (300, 2), minval=gait.SLOWEST, maxval=gait.FASTEST)
+    frames = jax.random.uniform(jax.random.key(7), (300, 2), minval=shaping.SLOWEST, maxval=shaping.FASTEST)
     jumping = course(shaping.taught(), jnp.repeat(frames, 6, axis=0), cpg.settled(cpg.Params()))
     walk = reference.walk(jumping)
     assert np.abs(walk.roll).max() < 4.0 and np.abs(walk.pitch).max() < 4.0

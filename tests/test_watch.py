@@ -43,7 +43,7 @@ def save(path: Path, frames: np.ndarray, rate: int = 30) -> Path:
 def run(path: Path, *flags: str) -> pa.Table:
     """Watch a video from the command line; give the table."""
     assert cli.main(["watch", str(path), "--out", str(path.parent / "out"), *flags]) == 0
-    folder = path.parent / "out" / path.stem
+    folder = path.parent / "out" / path.name
     assert sorted(file.suffix for file in folder.iterdir()) == sorted([".mp4", ".png", _suffix(flags)])
     found = folder / f"response{_suffix(flags)}"
     return pyarrow.csv.read_csv(found) if found.suffix == ".csv" else pyarrow.parquet.read_table(found)
@@ -113,7 +113,7 @@ def test_large_videos_are_averaged_down(tmp_path: Path) -> None:
 
 def test_the_overlay_shows_every_frame_and_where_the_cells_fire(tmp_path: Path) -> None:
     run(save(tmp_path / "disc.mp4", looming(72)), "--mono")
-    with av.open(str(tmp_path / "out" / "disc" / "overlay.mp4")) as container:
+    with av.open(str(tmp_path / "out" / "disc.mp4" / "overlay.mp4")) as container:
         assert container.streams.video[0].codec_context.name in ("h264", "libx264")
         frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
     assert len(frames) == FRAMES
@@ -179,10 +179,22 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 def test_a_failure_keeps_the_results_of_an_earlier_time(tmp_path: Path) -> None:
     path = save(tmp_path / "disc.mp4", looming(72))
     run(path)
-    before = {file.name: file.read_bytes() for file in (tmp_path / "out" / "disc").iterdir()}
+    before = {file.name: file.read_bytes() for file in (tmp_path / "out" / "disc.mp4").iterdir()}
     save(path, looming(72, 2))
     assert cli.main(["watch", str(path), "--out", str(tmp_path / "out")]) == 2
-    assert {file.name: file.read_bytes() for file in (tmp_path / "out" / "disc").iterdir()} == before
+    assert {file.name: file.read_bytes() for file in (tmp_path / "out" / "disc.mp4").iterdir()} == before
+
+
+def test_each_video_has_its_folder_and_the_folder_one_table(tmp_path: Path) -> None:
+    """`run` looks at what a folder holds: a table of one kind, the one asked for last."""
+    first = save(tmp_path / "disc.mp4", looming(72))
+    second = tmp_path / "disc.mkv"
+    second.write_bytes(first.read_bytes())
+    still = column(run(first), "u_right")
+    run(second, "--table", "parquet")
+    run(second, "--table", "csv")
+    assert sorted(folder.name for folder in (tmp_path / "out").iterdir()) == ["disc.mkv", "disc.mp4"]
+    np.testing.assert_array_equal(column(run(first, "--table", "parquet"), "u_right"), still)
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,6 @@ number, so that an interrupted run carries on with the episode that it was at.
 """
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from lgmdjax import calibration, drivers, episodes, hexapod, lgmd, rollout, scales
-from lgmdjax.runs import write_json
+from lgmdjax import braitenberg, calibration, drivers, episodes, hexapod, lgmd, rollout, scales
+from lgmdjax.runs import read_json, write_json
 from lgmdjax.stages import crew
 
 CHOSEN = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
@@ -45,7 +44,7 @@ def rooms_of(seed: int, episode: int, robots: int):
 
 def load_detector(folder: Path) -> lgmd.Params:
     """Read the detector that `collect` calibrated."""
-    chosen = json.loads((folder / "calibration.json").read_text())
+    chosen = read_json(folder / "calibration.json")
     return lgmd.Params(**{name: chosen[name] for name in CHOSEN})
 
 
@@ -65,5 +64,8 @@ def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any
 
 
 def _parameters(settings: scales.Collect, detector: lgmd.Params) -> dict[str, Any]:
+    """Tell what an episode was made with; room i of episode k is the i-th of `rooms_of(seed, k, robots)`."""
+    made = {name: getattr(settings, name) for name in ("robots", "seconds")}
     constants = {name: getattr(detector, name) for name in CHOSEN}
-    return {"eyes": dataclasses.asdict(settings.eyes), "seconds": settings.seconds, "lgmd": constants}
+    teacher = dataclasses.asdict(braitenberg.Params())
+    return made | {"eyes": dataclasses.asdict(settings.eyes), "lgmd": constants, "teacher": teacher}

@@ -75,7 +75,6 @@ def walks(
     label: str,
     *,
     draw: bool = True,
-    skip: int = 0,
 ) -> Iterator[simulation.Record]:
     """Walk a crowd and yield its chunks, with a bar of robot-seconds; the first chunk waits for the compiler."""
     robots = rooms.starts.shape[0]
@@ -87,5 +86,5 @@ def walks(
             yield chunk
 
 
-CHUNK = 5.0  # s of robot time between two signs of life, and what an interruption loses
+CHUNK = 5.0  # s of robot time between two signs of life
 BAR = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"

@@ -27,7 +27,7 @@ from lgmdjax import (
     simulation,
     trials,
 )
-from lgmdjax.runs import write_json
+from lgmdjax.runs import read_arrays, write_json
 from lgmdjax.stages import collect, crew
 
 PLACES = ("testing", "unseen")
@@ -60,7 +60,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Evaluate, se
 def load_drivers(train: Path) -> drivers.Anyone:
     """Seat the navigator that `train` made, and the direct and the random driver as it measured them."""
     learned, _ = navigator.load(train / "controller.safetensors")
-    baselines = np.load(train / "baselines.npz")
+    baselines = read_arrays(train / "baselines.npz")
     return crew.everyone(learned, float(baselines["gain"]), baselines["replayed"])
 
 

@@ -31,11 +31,13 @@ SHOWN = 60.0  # s, of fig. 12
 
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed: int) -> None:
     """Fit and walk in turns, then fit every variant on all walks, and keep the paper's as the controller."""
-    recorded = episodes.stretches(episodes.read(inputs["collect"] / "episodes"))
+    whole = episodes.read(inputs["collect"] / "episodes")
+    recorded = episodes.stretches(whole)
     np.savez(folder / "baselines.npz", allow_pickle=False, **_baselines(recorded))
     walks, header = recorded, episodes.parameters(inputs["collect"] / "episodes")
     for number in range(settings.rounds):
-        walks = walks + _own_walks(folder, inputs, settings, seed, number, walks)
+        own = _own_walks(folder, inputs, settings, seed, number, walks)
+        whole, walks = whole + own, walks + episodes.stretches(own)
     # By room. The paper halves every stretch; but a stretch ends where the robot touched something, so that its
     # second half is what a controller must learn most. One fit to the teacher's walks in halves stands beside.
     train, kept = training.split_by_room(walks, KEPT_BACK, seed)
@@ -54,7 +56,8 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
     curves = {variant: {"train": fit.train.tolist(), "test": fit.test.tolist()} for variant, fit in fits.items()}
     minutes = {name: sum(map(len, some)) / FRAME_RATE / 60 for name, some in sets.items()}
     table = training.table({variant: fit.best for variant, fit in fits.items()}, sets)
-    result = {"curves": curves, "table": table, "minutes": minutes, "caution": training.CAUTION}
+    lost = sum(not walk.ok[-1] for walk in whole)  # robots that fell, or whose state was not finite
+    result = {"curves": curves, "table": table, "minutes": minutes, "caution": training.CAUTION, "lost": lost}
     write_json(folder / "training.json", result)
     learned = training.enliven(fits["lstm"].best, test)
     navigator.save(
@@ -66,7 +69,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
 def _own_walks(
     folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed: int, number: int, walks: Sequence[Walk]
 ) -> list[Walk]:
-    """Fit the navigator to all walks so far, let it drive one episode, and return what it walked, labelled."""
+    """Fit the navigator to all walks so far, let it drive one episode, and return all that it walked, labelled."""
     place = folder / "walks" / f"round-{number}"
     writer = episodes.Writer(place, {"settings": dataclasses.asdict(settings), "round": number})
     if not writer.chunks:
@@ -87,7 +90,7 @@ def _own_walks(
         chunks = crew.walks(crew.seat(params, drivers.LEARNED), hexapod.build(), rooms, settings.round_seconds, label)
         numbers = episode * settings.robots + np.arange(settings.robots)
         writer.write(rollout.together(list(chunks)), episode=episode, rooms=numbers.tolist(), seed=seed)
-    return episodes.stretches(episodes.read(place))
+    return episodes.read(place)
 
 
 def _prediction(params: navigator.Params, walks: Sequence[Walk]) -> dict[str, np.ndarray]:

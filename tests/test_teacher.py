@@ -1,0 +1,39 @@
+"""The teacher in its body: what it teaches is a walk that touches nothing, where eq. 22 by itself does."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from lgmdjax import braitenberg, camera, drivers, hexapod, rollout, scenes, simulation
+
+pytestmark = pytest.mark.usefixtures("float32")
+TEACHER = braitenberg.Params()
+RULE = replace(TEACHER, full_turn=0.0, symmetry=0.0)  # eq. 22 within the gait's range
+
+
+def walked(teacher: braitenberg.Params) -> simulation.Record:
+    """Put eight robots into the middle of the paper's training room, each turned its own way, for a minute."""
+    params = simulation.assemble(teacher, teacher=teacher, eyes=camera.Params(width=16, height=12))
+    rooms = rollout.copies(jax.random.key(0), scenes.training_room(), 8)
+    chunks = rollout.chunks(params, hexapod.build(), rooms, drivers.TEACHER, 60.0, draw=False)
+    return rollout.together(list(chunks))
+
+
+def test_teacher_walks_the_training_room_and_touches_nothing():
+    """It goes 3.3 to 3.8 m, all robots meet something to turn from, and no leg comes nearer to it than 0.14 m."""
+    record = walked(TEACHER)
+    assert record.ok.all() and not record.contact.any()
+    assert record.clearance.min() > 0.05
+    assert record.distances.min(axis=(1, 2)).max() < 0.7
+    places = record.position[..., :2]
+    assert np.linalg.norm(np.diff(places, axis=1), axis=-1).sum(axis=1).min() > 2.5
+    assert np.linalg.norm(places - places[:, :1], axis=-1).max(axis=1).min() > 1.0  # nor does it circle
+
+
+def test_rule_without_the_tie_break_does_touch_what_is_in_it():
+    """From the same starts: seven of eight do."""
+    record = walked(RULE)
+    assert record.ok.all()
+    assert record.contact.any(axis=1).sum() >= 4
