@@ -31,6 +31,12 @@ def pytest_configure(config: pytest.Config) -> None:
         jaxtyping.install_import_hook("lgmdjax", "shapecheck.check")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Start with the files that have slow tests, so that no worker is left alone with one at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture
 def unchecked() -> Iterator[None]:
     """Let arguments of a wrong type through to the package, which refuses them in its own words."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from lgmdjax import (
     arena,
@@ -42,6 +43,7 @@ def room() -> simulation.Room:
     return simulation.Room(arena=scene, starts=jnp.zeros((1, 3)), key=jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_reverse_and_forward_mode_agree_on_the_command_error_of_a_frame():
     """Every leaf of LGMD, navigator, CPG and shaping network is reached: through legs, body, eyes and rule."""
     params, here, soft = robot(), room(), hexapod.differentiable(hexapod.build(), soft=True)

@@ -124,6 +124,7 @@ def test_stands_ten_seconds_in_c(body):
     assert abs(data.qpos[3]) > np.cos(np.radians(0.5) / 2)
 
 
+@pytest.mark.slow
 def test_stands_ten_seconds_in_mjx(model, run):
     starts = np.array([[0.3 * i, -0.2 * i, 0.7 * i] for i in range(LANES)])
     data = standing(model, starts)

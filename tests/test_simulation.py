@@ -16,7 +16,6 @@ from lgmdjax import (
     lgmd,
     navigator,
     rollout,
-    scenes,
     simulation,
 )
 
@@ -149,23 +148,21 @@ def test_blind_walk_without_pictures_is_the_same_walk(params, model, start, room
     np.testing.assert_array_equal(record.u, 0.5)
 
 
-def test_chunks_of_a_crowd_are_one_walk(params, model):
-    keys = jax.random.split(jax.random.key(1), 4)  # two a device
-    arenas = [scenes.random_room(key) for key in keys]
-    rooms = rollout.stack(
-        [simulation.Room(arena=a, starts=a.start[None], key=k) for a, k in zip(arenas, keys, strict=True)]
-    )
+@pytest.mark.slow
+def test_chunks_of_a_crowd_are_one_walk(walk, params, model, room):
+    """Of four, two a device, each with a start of its own."""
+    starts = jnp.asarray([[[0.0, 0.0, 0.3 * k]] for k in range(4)])
+    rooms = rollout.stack([room.replace(starts=start) for start in starts])
     own = params.controller.replace(driver=params.controller.driver.replace(seat=seat(drivers.TEACHER)))
     crowd = params.replace(controller=own)
-    short = rollout.together(
-        list(rollout.chunks(crowd, model, rooms, drivers.ANYONE, 1.0, draw=False, chunk_seconds=0.4))
-    )
-    assert short.time.shape == (4, 30)
-    np.testing.assert_allclose(short.time[0], np.arange(30) / 30)
-    one = jax.tree.map(lambda leaf: leaf[3], rooms)
-    state = simulation.init(crowd, model, one, drivers.ANYONE)
-    _, alone = jax.jit(lambda s: rollout.walk(crowd, model, one, s, drivers.ANYONE, 30, False))(state)
+    chunks = rollout.chunks(crowd, model, rooms, drivers.ANYONE, FRAMES / 30, draw=False, chunk_seconds=0.4)
+    short = rollout.together(list(chunks))
+    assert short.time.shape == (4, FRAMES)
+    np.testing.assert_allclose(short.time[0], np.arange(FRAMES) / 30)
+    last = room.replace(starts=starts[3])
+    _, alone = walk(seat(drivers.TEACHER), last, simulation.init(crowd, model, last, drivers.ANYONE))
     np.testing.assert_allclose(short.position[3], alone.position, atol=1e-8)
+    np.testing.assert_allclose(short.label[3], alone.label, atol=1e-8)
 
 
 @pytest.mark.parametrize(("robots", "shares"), [(1, 1), (2, 1), (3, 1), (4, 2), (6, 2), (7, 1)])

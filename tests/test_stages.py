@@ -36,6 +36,7 @@ def run(out):
     return out / "smoke"
 
 
+@pytest.mark.slow
 def test_every_stage_left_its_files(run):
     for stage, names in {
         "fit-gait": ("shaping.safetensors", "gait.json", "cpg.npz", "foot.npz"),

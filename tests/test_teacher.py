@@ -21,6 +21,7 @@ def walked(teacher: braitenberg.Params) -> simulation.Record:
     return rollout.together(list(chunks))
 
 
+@pytest.mark.slow
 def test_teacher_walks_the_training_room_and_touches_nothing():
     """It goes 3.3 to 3.8 m, all robots meet something to turn from, and no leg comes nearer to it than 0.14 m."""
     record = walked(TEACHER)
