@@ -3,11 +3,14 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from lgmdjax import arena, camera, hexapod, rollout
+from lgmdjax import arena, camera, hexapod, rollout, simulation
 from lgmdjax.simulation import Leaf, Record
+
+FRAMES = 30  # drawn by one call; the last frame of a walk fills it up
 
 
 def walks(
@@ -16,31 +19,46 @@ def walks(
     """Draw what the eyes of a crowd saw once more, grey levels 0..255: bit for bit on the machine where it walked.
 
     One program draws every frame, so that any part of a walk gives the same bits. They are those of the walk if the
-    whole crowd is drawn on as many devices, since the compiler may round a crowd of another size otherwise, by less
-    than 0.001 grey levels in single precision.
+    whole crowd is drawn on as many devices, since the compiler may round a crowd of another size otherwise, by a few
+    thousandths of a grey level in single precision.
 
     Args:
         rooms: a room a robot; things that move are put where they were.
         record: axes (robot, frame), as `batched` gives it.
     """
-    poses = (np.asarray(leaf) for leaf in (record.time, record.position, record.quaternion))
-    moments = zip(*(leaf.swapaxes(0, 1) for leaf in poses), strict=True)
-    return np.stack([_frames(eyes, rooms, *at) for at in moments], axis=1)
+    poses = [np.asarray(leaf) for leaf in (record.time, record.position, record.quaternion)]
+    frames = poses[0].shape[1]
+    parts = []
+    for first in range(0, frames, FRAMES):
+        these = np.minimum(np.arange(first, first + FRAMES), frames - 1)
+        pictures = _frames(eyes, rooms, *(leaf[:, these] for leaf in poses), draw=True)
+        parts.append(np.asarray(pictures)[:, : frames - first])
+    return np.concatenate(parts, axis=1)
 
 
 @partial(jax.jit, static_argnames="eyes")
-def _frames(eyes: camera.Params, rooms: arena.Arena, *poses: Leaf) -> Float[Array, "robots 2 height columns"]:
-    return rollout.deal(partial(frame, eyes), rooms, *poses)
+def _frames(
+    eyes: camera.Params, rooms: arena.Arena, *poses: Leaf, draw: Bool[Array, ""] | bool
+) -> Float[Array, "robots frames 2 height columns"]:
+    """Draw as `rollout.advance` does: in a loop over frames, where `draw` is known at run time only.
+
+    Where the compiler knows more, it computes what it can beforehand, and comes to other last bits.
+    """
+
+    def robot(room: arena.Arena, *poses: Leaf) -> Array:
+        return jax.lax.map(lambda pose: frame(eyes, room, *pose, draw), poses)
+
+    return rollout.deal(robot, rooms, *poses)
 
 
-@partial(jax.jit, static_argnames="eyes")
 def frame(
     eyes: camera.Params,
     room: arena.Arena,
-    time: Float[Array, ""],
-    position: Float[Array, "3"],
-    quaternion: Float[Array, "4"],
+    time: Float[Leaf, ""],
+    position: Float[Leaf, "3"],
+    quaternion: Float[Leaf, "4"],
+    draw: Bool[Array, ""] | bool = True,
 ) -> Float[Array, "2 height columns"]:
     """Draw what both eyes see from a pose of the trunk [m, 1], at a time [s] that tells where moving things are."""
-    pose = hexapod.Pose(position=position, quaternion=quaternion)
-    return camera.render(eyes, arena.at(room, time), *hexapod.eye_poses(pose))
+    pose = hexapod.Pose(position=jnp.asarray(position), quaternion=jnp.asarray(quaternion))
+    return simulation.look(eyes, arena.at(room, jnp.asarray(time)), pose, draw)

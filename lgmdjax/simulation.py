@@ -176,20 +176,29 @@ def sense(
     distances = laser.hemifields(laser.scan(params.laser, scene, *hexapod.laser_pose(pose)))
     nerves = state.controller
 
-    # One program for both, which takes half a minute to compile; the choice is the same for a whole crowd. Only the
-    # drawing is in it, since XLA would else draw anew inside each of the loops that read the picture, each time with
-    # other last bits; `redraw.walks` gives the same ones.
-    frames = jax.lax.cond(
-        draw,
-        lambda: camera.render(params.camera, scene, *hexapod.eye_poses(pose)),
-        lambda: jnp.zeros(camera.shape(params.camera), nerves.lgmd.frame.dtype),
-    )
+    frames = look(params.camera, scene, pose, draw)
     opened = _where(state.fresh, controller.open_eyes(params.controller, frames), nerves.lgmd)
     nerves, response = controller.see(params.controller, replace(nerves, lgmd=opened), frames)
     senses = Senses(
         u=response.u, feed_forward=response.feed_forward, excitation=response.excitation, distances=distances
     )
     return replace(state, controller=nerves), senses
+
+
+def look(
+    eyes: camera.Params, scene: arena.Arena, pose: hexapod.Pose, draw: Bool[Array, ""] | bool = True
+) -> Float[Array, "2 height columns"]:
+    """Draw what both eyes see from a pose of the trunk, in grey levels 0..255; black without `draw`.
+
+    Given `draw` as an array, the choice is made at run time, so that one program serves walks with and without
+    pictures, and the drawing is compiled by itself. XLA would else draw anew inside each of the loops that read the
+    picture, and round differently in each program.
+    """
+    return jax.lax.cond(
+        draw,
+        lambda: camera.render(eyes, scene, *hexapod.eye_poses(pose)),
+        lambda: jnp.zeros(camera.shape(eyes), pose.position.dtype),
+    )
 
 
 def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tuple[State, Float[Array, "2"]]:

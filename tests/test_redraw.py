@@ -16,7 +16,8 @@ from lgmdjax import (
 )
 
 ROBOTS = 4  # two a device
-EYES = camera.Params(width=48, height=36, overlap=0.6)
+EYES = camera.Params(width=80, height=60, overlap=0.6)
+FRAMES = 45  # more than one call of the drawing program, and less than two
 
 
 @pytest.mark.slow
@@ -28,7 +29,7 @@ def test_pictures_are_drawn_again_from_the_poses(tmp_path):
     rooms = rollout.random_rooms(jax.random.key(1), ROBOTS, density=0.3)
     states, seen = rollout.start(params, model, rooms, driver=drivers.BLIND), []
     writer = episodes.Writer(tmp_path, {})
-    for _ in range(30):
+    for _ in range(FRAMES):
         states, chunk = rollout.advance(params, model, rooms, states, driver=drivers.BLIND, frames=1, draw=True)
         seen.append(np.array(states.controller.lgmd.frame))
         writer.write(chunk, episode=0, rooms=range(ROBOTS), seed=1)
@@ -39,4 +40,4 @@ def test_pictures_are_drawn_again_from_the_poses(tmp_path):
     part, alone = (jax.tree.map(lambda leaf, of=of: leaf[of], walked) for of in (np.s_[:, 7:11], np.s_[1:]))
     np.testing.assert_array_equal(drawn[:, 7:11], redraw.walks(EYES, rooms.arena, part))
     second = jax.tree.map(lambda leaf: leaf[1:], rooms.arena)
-    np.testing.assert_allclose(drawn[1:], redraw.walks(EYES, second, alone), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(drawn[1:], redraw.walks(EYES, second, alone), rtol=0, atol=1e-2)

@@ -111,11 +111,10 @@ def _layers(detector: lgmd.Params, eyes: scales.Eyes, walk: simulation.Record) -
     """Draw the frame of a walk that excited its left eye most, whole and at the paper's resolution, with its layers."""
     steady = np.where(np.asarray(walk.setbacks) == walk.setbacks[-1], walk.excitation[:, 0], 0.0)
     last = max(int(np.argmax(steady)), 2)
-    pictures = [
-        redraw.frame(camera.Params(), scenes.testing_room(), walk.time[k], walk.position[k], walk.quaternion[k])[0]
-        for k in range(last - 2, last + 1)
-    ]
+    frames = jax.tree.map(lambda leaf: np.asarray(leaf)[None, last - 2 : last + 1], walk)
+    room = jax.tree.map(lambda leaf: leaf[None], scenes.testing_room())
+    pictures = redraw.walks(camera.Params(), room, frames)[0, :, 0]
     state, _ = lgmd.step(detector, lgmd.init(detector, pictures[0]), pictures[1])
     cells = lgmd.layers(detector, state, pictures[2])
     named = {"E": cells.excitation, "I": cells.inhibition, "S": cells.summation}
-    return {"picture": np.asarray(pictures[2])} | {name: np.asarray(layer) for name, layer in named.items()}
+    return {"picture": pictures[2]} | {name: np.asarray(layer) for name, layer in named.items()}
