@@ -22,7 +22,7 @@ import optax
 import tyro
 from flax import nnx
 
-from lgmdjax import navigator, training
+from lgmdjax import navigator, tapes, training
 from lgmdjax.episodes import FIELDS, Walk
 from lgmdjax.simulation import FRAME_RATE
 
@@ -43,7 +43,7 @@ def invented(seed: int) -> Walk:
 
 def ours(walks: list[Walk], epochs: int) -> float:
     """Seconds of a fit, compilation and checkpoints included."""
-    first, second = training.halve(walks)
+    first, second = tapes.halve(walks)
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         start = navigator.create(jax.random.key(0))
@@ -70,7 +70,7 @@ def looped(walks: list[Walk], epochs: int) -> float:
         return error
 
     settings = training.Settings()
-    first, _ = training.halve(walks)
+    first, _ = tapes.halve(walks)
     u, label = (_windows(np.concatenate([getattr(walk, name) for walk in first]), settings) for name in ("u", "label"))
     network = Network(nnx.Rngs(0))
     optimiser = nnx.Optimizer(network, optax.rmsprop(1e-3, decay=0.9, eps=1e-7), wrt=nnx.Param)

@@ -5,7 +5,7 @@ from pathlib import Path
 import jax
 from tqdm import tqdm
 
-from lgmdjax import gait, hexapod, legs, shaping
+from lgmdjax import hexapod, legs, lesson, shaping
 
 STEPS, SEED = 6000, 1
 TAUGHT = Path(shaping.__file__).parent / "data" / "shaping.safetensors"
@@ -19,7 +19,7 @@ def main() -> None:
             bar.set_postfix_str(f"{loss**0.5:.2f} mm", refresh=False)
             bar.update(done - bar.n)
 
-        networks = gait.teach(legs.geometry(hexapod.load()), key=jax.random.key(SEED), steps=STEPS, progress=show)
+        networks = lesson.teach(legs.geometry(hexapod.load()), key=jax.random.key(SEED), steps=STEPS, progress=show)
     shaping.save(TAUGHT, networks, {"steps": STEPS, "seed": SEED})
 
 

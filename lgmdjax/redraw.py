@@ -46,7 +46,7 @@ def _frames(
     """
 
     def robot(room: arena.Arena, *poses: Leaf) -> Array:
-        return jax.lax.map(lambda pose: frame(eyes, room, *pose, draw), poses)
+        return jax.lax.map(lambda pose: frame(eyes, room, *pose, draw=draw), poses)
 
     return rollout.deal(robot, rooms, *poses)
 

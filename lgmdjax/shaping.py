@@ -12,7 +12,7 @@ stance and swing differ.
 | v^left, right  | velocity      | nominal velocity | sec. 3.2  |
 | -              | targets       | rad              | sec. 3.2  |
 
-Source: Cizek & Faigl, sec. 3.2. The networks are taught by `lgmdjax.gait.teach`.
+Source: Cizek & Faigl, sec. 3.2. The networks are taught by `lgmdjax.lesson.teach`.
 """
 
 import json

@@ -1,7 +1,7 @@
 """Fits of the navigator to recorded walks: back-propagation through time over windows, the state carried on.
 
-Stretches of walking are laid end to end on a tape, and the tape is cut into streams that are walked side by
-side, so that a network of 32 units fills a processor. A window of frames is one step of RMSprop; the state
+Stretches of walking lie end to end on a tape (`lgmdjax.tapes`), cut into streams that are walked side by side, so
+that a network of 32 units fills a processor. A window of frames is one step of RMSprop; the state
 goes on into the next window, without its gradient, and starts anew where a stretch or a stream starts.
 
 | symbol | name          | unit              | equation                                    |
@@ -31,13 +31,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
 from lgmdjax import navigator
 from lgmdjax.checkpoints import Checkpoints
 from lgmdjax.episodes import Walk
 from lgmdjax.errors import InputError
+from lgmdjax.tapes import Tape, lay
 
 CAUTION = 1.5
 """By how much a driver should turn harder than its teacher. One network, 120 m in unseen rooms: 8.4 collisions per
@@ -60,17 +61,6 @@ class Settings:
 
 
 @struct.dataclass(kw_only=True)
-class Tape:
-    """Frames to learn from, by window, frame in the window, and stream."""
-
-    u: Float[Array, "windows frames streams 2"]
-    label: Float[Array, "windows frames streams 2"]
-    last: Float[Array, "windows frames streams 2"]  # velocity of the frame before
-    fresh: Bool[Array, "windows frames streams"]  # nothing is remembered from before this frame
-    counts: Float[Array, "windows frames streams"]  # 1, or 0 where the tape is padded
-
-
-@struct.dataclass(kw_only=True)
 class Progress:
     """Where a fit is; everything that it needs to go on."""
 
@@ -90,24 +80,6 @@ class Fit:
     best: navigator.Params
     train: Float[np.ndarray, "epochs"]
     test: Float[np.ndarray, "epochs"]
-
-
-def halve(walks: Sequence[Walk]) -> tuple[list[Walk], list[Walk]]:
-    """Split every stretch in its middle, as the paper splits its data: first halves train, others test."""
-    return [w[: len(w) // 2] for w in walks], [w[len(w) // 2 :] for w in walks]
-
-
-def split_by_room(walks: Sequence[Walk], unseen: float, seed: int) -> tuple[list[Walk], list[Walk]]:
-    """Keep whole rooms back: walks in the others, and in a fraction `unseen` of rooms, drawn by seed."""
-    rooms = sorted({walk.room for walk in walks})
-    if not 0 < unseen < 1 or len(rooms) < 2:
-        raise InputError(
-            f"training: expected a fraction in 0..1 of two rooms or more, got {unseen} of {len(rooms)}; "
-            "collect more rooms"
-        )
-    count = min(max(1, round(unseen * len(rooms))), len(rooms) - 1)
-    kept = set(np.random.default_rng(seed).permutation(rooms)[:count].tolist())
-    return [w for w in walks if w.room not in kept], [w for w in walks if w.room in kept]
 
 
 def standardise(params: navigator.Params, walks: Sequence[Walk], mirrored: bool = True) -> navigator.Params:
@@ -331,29 +303,8 @@ def _states(params: navigator.Params, tape: Tape) -> navigator.State:
 
 
 def _tape(params: navigator.Params, walks: Sequence[Walk], settings: Settings) -> Tape:
-    """Lay walks end to end, cut them into streams of whole windows, and add the mirrored streams."""
-    first = np.asarray(params.output_mean)[None]
-    u, label = (np.concatenate([getattr(walk, name) for walk in walks]) for name in ("u", "label"))
-    last = np.concatenate([np.concatenate([first, walk.velocity[:-1]]) for walk in walks])
-    fresh = np.concatenate([np.arange(len(walk)) == 0 for walk in walks])
-    frames = len(fresh)
-    windows = max(1, round(frames / (settings.streams * settings.window)))
-    length = -(-frames // (settings.streams * windows))  # of a window, rounded up: little is padded
-
-    def lay(values: np.ndarray) -> np.ndarray:
-        padding = settings.streams * windows * length - frames
-        values = np.pad(values, ((0, padding), *((0, 0),) * (values.ndim - 1)))
-        values = values.reshape(settings.streams, windows, length, *values.shape[1:])
-        values = np.moveaxis(values, 0, 2)
-        if not settings.mirrored:
-            return values
-        swapped = values[..., ::-1] if values.ndim == 4 else values
-        return np.concatenate([values, swapped], axis=2)
-
-    fresh = lay(fresh)
-    fresh[0, 0] = True
-    u, label, last, counts = (jnp.asarray(lay(x), dtype=float) for x in (u, label, last, np.ones(frames)))
-    return Tape(u=u, label=label, last=last, fresh=jnp.asarray(fresh), counts=counts)
+    first = np.asarray(params.output_mean)
+    return lay(walks, first, streams=settings.streams, window=settings.window, mirrored=settings.mirrored)
 
 
 def _checked(settings: Settings, train: Sequence[Walk], test: Sequence[Walk]) -> Settings:

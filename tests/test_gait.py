@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from lgmdjax import cpg, gait, hexapod, legs, shaping
+from lgmdjax import cpg, gait, hexapod, legs, lesson, shaping
 
 TRIPODS = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.5])
 RANGE = np.linspace(shaping.SLOWEST, shaping.FASTEST, 7)
@@ -26,7 +26,7 @@ def geometry(body):
 def taught(geometry):
     """A short lesson, enough to look at; the packaged networks had twenty times as long."""
     losses = []
-    networks = gait.teach(geometry, steps=300, candidates=6, progress=lambda *told: losses.append(told))
+    networks = lesson.teach(geometry, steps=300, candidates=6, progress=lambda *told: losses.append(told))
     return networks, losses
 
 
@@ -152,16 +152,16 @@ def test_targets_run_ahead_and_beyond(geometry):
 
 def test_limit_cycle_is_the_settled_rhythm_whatever_the_cycle_time():
     phases = np.arange(8) / 8
-    settled = gait.limit_cycle(cpg.Params(), phases)
+    settled = lesson.limit_cycle(cpg.Params(), phases)
     assert settled[0, 0] == pytest.approx(0.0, abs=1e-3) and settled[1, 0] > 0
     np.testing.assert_allclose(settled[:4], -settled[4:], atol=1e-3)
-    np.testing.assert_allclose(gait.limit_cycle(cpg.Params(cycle_time=0.5), phases), settled, atol=1e-6)
+    np.testing.assert_allclose(lesson.limit_cycle(cpg.Params(cycle_time=0.5), phases), settled, atol=1e-6)
 
 
 def foot_error(networks, geometry, velocity):
     """RMS distance [mm] of the standing feet from where the gait wants them, around the cycle."""
     figures, steps = gait.Gait(), 60
-    settled = gait.limit_cycle(cpg.Params(), np.arange(steps) / steps)
+    settled = lesson.limit_cycle(cpg.Params(), np.arange(steps) / steps)
     phase = jnp.arange(steps)[:, None] / steps + TRIPODS
     rhythm = jnp.asarray(np.stack([settled, np.roll(settled, -steps // 2, axis=0)] * 3, axis=1))
     angles = jax.vmap(shaping.shape, (None, 0, None))(networks, rhythm, jnp.full(2, velocity))
@@ -193,7 +193,7 @@ def test_right_legs_are_the_left_ones_mirrored(taught):
 
 def test_the_papers_input_cannot_learn_it(geometry):
     """A map of one scalar traces an open curve: the feet miss by more than half the stride."""
-    networks = gait.teach(geometry, steps=150, candidates=6, literal=True)
+    networks = lesson.teach(geometry, steps=150, candidates=6, literal=True)
     assert networks.literal
     assert foot_error(networks, geometry, 1.0) > 6.0
 
@@ -205,6 +205,6 @@ def test_runs_in_either_precision(precision, strict, body):
 
 
 def test_teaches_in_single_precision(float32, strict, body):
-    networks = gait.teach(gait.geometry(body), steps=10, candidates=6)
+    networks = lesson.teach(gait.geometry(body), steps=10, candidates=6)
     assert networks.w1.dtype == "float32"
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(networks))

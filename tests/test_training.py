@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lgmdjax import navigator, training
+from lgmdjax import navigator, tapes, training
 from lgmdjax.checkpoints import Checkpoints
 from lgmdjax.episodes import Walk
 from lgmdjax.errors import InputError
@@ -53,7 +53,7 @@ def walk(seed, frames, room=0):
 @pytest.fixture(scope="module")
 def data():
     """Training and test stretches, and two of a room that neither has."""
-    return *training.halve([walk(s, 900) for s in range(8)]), [walk(50, 600, room=1), walk(51, 500, room=1)]
+    return *tapes.halve([walk(s, 900) for s in range(8)]), [walk(50, 600, room=1), walk(51, 500, room=1)]
 
 
 def settings(**changes: Any) -> training.Settings:
@@ -237,7 +237,7 @@ def test_the_tape_holds_every_frame_once():
     """In order along each stream; padding counts for nothing; mirrored streams are swapped."""
     walks = [walk(s, 50 + 7 * s) for s in range(5)]
     params = training.standardise(navigator.create(jax.random.key(0)), walks)
-    tape = training._tape(params, walks, settings(streams=3, window=20, mirrored=True))
+    tape = tapes.lay(walks, np.asarray(params.output_mean), streams=3, window=20, mirrored=True)
     streams = np.moveaxis(np.asarray(tape.u), 2, 0).reshape(6, -1, 2)
     counts = np.moveaxis(np.asarray(tape.counts), 2, 0).reshape(6, -1).astype(bool)
     u = np.concatenate([w.u for w in walks])
@@ -272,17 +272,17 @@ def test_an_efference_copy_of_what_was_told(data):
 
 def test_splits_keep_walks_and_rooms_apart():
     walks = [walk(s, 40, room=s % 4) for s in range(8)]
-    first, second = training.halve(walks)
+    first, second = tapes.halve(walks)
     assert [len(w) for w in first + second] == [20] * 16
     np.testing.assert_array_equal(first[3].u, walks[3].u[:20])
     np.testing.assert_array_equal(second[3].u, walks[3].u[20:])
-    seen, unseen = training.split_by_room(walks, unseen=0.3, seed=1)
+    seen, unseen = tapes.split_by_room(walks, unseen=0.3, seed=1)
     rooms = {w.room for w in seen}, {w.room for w in unseen}
     assert not rooms[0] & rooms[1] and len(rooms[1]) == 1 and len(seen) + len(unseen) == 8
-    assert {w.room for w in training.split_by_room(walks, 0.3, 1)[1]} == rooms[1]
+    assert {w.room for w in tapes.split_by_room(walks, 0.3, 1)[1]} == rooms[1]
     for fraction, some in ((0.0, walks), (0.5, walks[:1])):
         with pytest.raises(InputError, match="training: expected a fraction"):
-            training.split_by_room(some, fraction, 0)
+            tapes.split_by_room(some, fraction, 0)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reference import walking as reference
 
-from lgmdjax import cpg, gait, hexapod, shaping
+from lgmdjax import cpg, gait, hexapod, lesson, shaping
 
 STEP = 1 / 180
 CYCLE = round(cpg.CYCLE_TIME / STEP)
@@ -106,7 +106,7 @@ def test_walks_after_a_random_start_of_the_rhythm():
 
 def test_the_papers_input_hardly_walks():
     geometry = gait.geometry(hexapod.load())
-    networks = gait.teach(geometry, steps=300, candidates=6, literal=True)
+    networks = lesson.teach(geometry, steps=300, candidates=6, literal=True)
     assert abs(reference.walk(targets(1.0, 1.0, networks=networks)).speed) < 0.012
 
 

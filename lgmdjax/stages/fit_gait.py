@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from lgmdjax import cpg, gait, hexapod, legs, scales, shaping, treadmill
+from lgmdjax import cpg, gait, hexapod, legs, lesson, scales, shaping, treadmill
 from lgmdjax.runs import write_json
 
 SWEEP = ((1.0, 1.0), (0.5, 0.5), (1.2, 1.2), (2.0, 2.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0))
@@ -52,7 +52,7 @@ def _teach(body: Any, settings: scales.FitGait, seed: int, literal: bool) -> sha
             bar.set_postfix_str(f"{math.sqrt(max(loss, 0)):.2f} mm", refresh=False)
             bar.update(done - bar.n)
 
-        return gait.teach(
+        return lesson.teach(
             legs.geometry(body), key=jax.random.key(seed), steps=settings.steps, literal=literal, progress=show
         )
 

@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lgmdjax import drivers, episodes, hexapod, lgmd, navigator, rollout, scales, training
+from lgmdjax import drivers, episodes, hexapod, lgmd, navigator, rollout, scales, tapes, training
 from lgmdjax.episodes import Walk
 from lgmdjax.runs import write_json
 from lgmdjax.simulation import FRAME_RATE
@@ -40,8 +40,8 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
         whole, walks = whole + own, walks + episodes.stretches(own)
     # By room. The paper halves every stretch; but a stretch ends where the robot touched something, so that its
     # second half is what a controller must learn most. One fit to the teacher's walks in halves stands beside.
-    train, kept = training.split_by_room(walks, KEPT_BACK, seed)
-    test, unseen = training.split_by_room(kept, 0.5, seed)
+    train, kept = tapes.split_by_room(walks, KEPT_BACK, seed)
+    test, unseen = tapes.split_by_room(kept, 0.5, seed)
 
     def fit(name: str, variant: navigator.Variant, train: list[Walk], test: list[Walk]) -> training.Fit:
         epochs = training.Settings(epochs=settings.epochs if variant != "mean" else 1)
@@ -50,7 +50,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
 
     fits = {str(variant): fit(variant, variant, train, test) for variant in navigator.VARIANTS}
     shown = {walk.room for walk in train}
-    first, second = training.halve([walk for walk in recorded if walk.room in shown])
+    first, second = tapes.halve([walk for walk in recorded if walk.room in shown])
     fits["lstm-halves"] = fit("lstm-halves", "lstm", first, second)
     sets = {"train": train, "test": test, "unseen": unseen}
     curves = {variant: {"train": fit.train.tolist(), "test": fit.test.tolist()} for variant, fit in fits.items()}
@@ -73,7 +73,7 @@ def _own_walks(
     place = folder / "walks" / f"round-{number}"
     writer = episodes.Writer(place, {"settings": dataclasses.asdict(settings), "round": number})
     if not writer.chunks:
-        train, test = training.split_by_room(walks, KEPT_BACK, seed)
+        train, test = tapes.split_by_room(walks, KEPT_BACK, seed)
         fit = training.fit(
             navigator.create(jax.random.key(seed)),
             train,
