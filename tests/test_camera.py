@@ -174,9 +174,8 @@ def test_gradients_are_those_of_central_differences_in_both_modes():
         return camera.render(tiny, moved, positions, about_z @ rotation)
 
     at = jnp.asarray(positions), jnp.asarray(0.0), room.boxes.centre
-    quickly = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # few calls, long programs
-    both = quickly(lambda at, along: jax.jvp(seen, at, along))
-    gradient = quickly(jax.grad(lambda *at: jnp.vdot(weights, seen(*at)), argnums=(0, 1, 2)))(*at)
+    both = jax.jit(lambda at, along: jax.jvp(seen, at, along))
+    gradient = jax.jit(jax.grad(lambda *at: jnp.vdot(weights, seen(*at)), argnums=(0, 1, 2)))(*at)
     picture = jax.jit(seen)
     rng = np.random.default_rng(1)
     for part in range(3):

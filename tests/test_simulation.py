@@ -67,8 +67,14 @@ def walk(params, model):
 
 
 @pytest.fixture(scope="module")
-def start(params, model, room):
-    return simulation.init(params, model, room, drivers.ANYONE)
+def put(params, model):
+    """Put a robot into a room."""
+    return jax.jit(lambda room: simulation.init(params, model, room, drivers.ANYONE))
+
+
+@pytest.fixture(scope="module")
+def start(put, room):
+    return put(room)
 
 
 def seat(driver):
@@ -104,23 +110,21 @@ def test_eyes_are_quiet_at_first_and_see_the_walk_afterwards(walk, start, room):
     assert np.all(np.asarray(record.u)[5:].max(axis=0) > 0.5)
 
 
-def test_touch_sets_the_robot_back_at_the_next_start(walk, params, model, room):
+def test_touch_sets_the_robot_back_at_the_next_start(walk, put, room):
     inside = room.replace(starts=jnp.asarray([[0.5, 0.4, 0.0], [-1.0, 1.0, 0.5]]))
-    state = simulation.init(params, model, inside, drivers.ANYONE)
-    _, record = walk(seat(drivers.BLIND), inside, state)
+    _, record = walk(seat(drivers.BLIND), inside, put(inside))
     assert bool(record.contact[0])
     assert record.setbacks.tolist() == [0] + [1] * (FRAMES - 1)
     np.testing.assert_allclose(record.position[1, :2], [-1.0, 1.0], atol=1e-9)
     np.testing.assert_array_equal(record.u[1], 0.5)  # a new place is no looming
 
 
-def test_box_that_comes_is_scanned_where_it_is_and_touched_when_it_is_there(walk, params, model, room):
+def test_box_that_comes_is_scanned_where_it_is_and_touched_when_it_is_there(walk, put, room):
     """It stands for a tenth of a second, then comes along the way ahead at 1.2 m/s."""
     boxes = arena.place([[0.9, 0.0]], 0.2, 0.8, goal=[[0.3, 0.0]], departs=0.1, arrives=0.6)
     scene = replace(room.arena, boxes=boxes)
     coming = room.replace(arena=scene, starts=jnp.asarray([[0.0, 0.0, 0.0], [-1.0, 1.0, 0.5]]))
-    state = simulation.init(params, model, coming, drivers.ANYONE)
-    _, record = walk(seat(drivers.BLIND), coming, state)
+    _, record = walk(seat(drivers.BLIND), coming, put(coming))
 
     touched = int(np.argmax(record.contact))
     assert touched > 3 and not record.contact[touched + 1 :].any()
@@ -149,7 +153,7 @@ def test_blind_walk_without_pictures_is_the_same_walk(params, model, start, room
 
 
 @pytest.mark.slow
-def test_chunks_of_a_crowd_are_one_walk(walk, params, model, room):
+def test_chunks_of_a_crowd_are_one_walk(walk, put, params, model, room):
     """Of four, two a device, each with a start of its own."""
     starts = jnp.asarray([[[0.0, 0.0, 0.3 * k]] for k in range(4)])
     rooms = rollout.stack([room.replace(starts=start) for start in starts])
@@ -160,7 +164,7 @@ def test_chunks_of_a_crowd_are_one_walk(walk, params, model, room):
     assert short.time.shape == (4, FRAMES)
     np.testing.assert_allclose(short.time[0], np.arange(FRAMES) / 30)
     last = room.replace(starts=starts[3])
-    _, alone = walk(seat(drivers.TEACHER), last, simulation.init(crowd, model, last, drivers.ANYONE))
+    _, alone = walk(seat(drivers.TEACHER), last, put(last))
     np.testing.assert_allclose(short.position[3], alone.position, atol=1e-8)
     np.testing.assert_allclose(short.label[3], alone.label, atol=1e-8)
 
