@@ -83,7 +83,7 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "fit-gait": FitGait(steps=3000, seconds=20),
         "collect": Collect(eyes=_QUICK, robots=16, episodes=2, seconds=45, calibration_seconds=20),
         "train": Train(eyes=_QUICK, epochs=80, rounds=3, round_epochs=60, robots=16, round_seconds=60),
-        "evaluate": Evaluate(eyes=_QUICK, robots=16, seconds=80, testing_seconds=20),
+        "evaluate": Evaluate(eyes=_QUICK, robots=16, seconds=70, testing_seconds=20),
         "report": Report(video_seconds=10),
     },
     "paper": {
