@@ -74,10 +74,10 @@ _SMALL, _QUICK, _PAPER = Eyes(width=64, height=48), Eyes(width=80, height=60), E
 SCALES: Mapping[Scale, Mapping[str, Any]] = {
     "smoke": {
         "fit-gait": FitGait(steps=300, seconds=6),
-        "collect": Collect(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=10),
+        "collect": Collect(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=5),
         "train": Train(eyes=_SMALL, epochs=5, rounds=1, round_epochs=5, robots=4, round_seconds=10),
-        "evaluate": Evaluate(eyes=_SMALL, robots=4, seconds=10, testing_seconds=10),
-        "report": Report(video_seconds=2),
+        "evaluate": Evaluate(eyes=_SMALL, robots=4, seconds=5, testing_seconds=5),
+        "report": Report(video_seconds=1),
     },
     "quick": {
         "fit-gait": FitGait(steps=3000, seconds=20),
