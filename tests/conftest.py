@@ -11,7 +11,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that crowds are dealt out
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls its own tuning flags errors
-# Most of the tests' time is compilation. XLA's older code generator needs a third less of it for programs as fast.
+# Most of the tests' time is compilation, of which XLA's older code generator needs a third less. What it makes is
+# slower where much is drawn, but little is drawn here.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax
