@@ -82,18 +82,21 @@ def survey(
     # What no candidate changes, the next state and FF, is evaluated once.
     see_all = jax.vmap(see, in_axes=(0, None, None), out_axes=(None, 0, None))
 
-    def walk(room: arena.Arena, poses: tuple[Array, Array, Array]):
-        def frame(state: lgmd.State, pose: tuple[Array, Array, Array]):
-            pictures = redraw.frame(eyes, room, *pose)
-            state, u, FF = jax.vmap(see_all, in_axes=(None, 0, 0))(candidates, state, pictures)
-            return state, (u, FF)
+    open_eyes = jax.vmap(partial(lgmd.init, params))
 
-        first = redraw.frame(eyes, room, *(leaf[0] for leaf in poses))
-        opened = jax.vmap(lgmd.init, in_axes=(None, 0))(params, first)
-        return jax.lax.scan(frame, opened, poses)[1]
+    def frame(room: arena.Arena, state: lgmd.State, row: tuple[Array, ...]):
+        fresh, *pose = row
+        pictures = redraw.frame(eyes, room, *pose)
+        opened = jax.tree.map(partial(jnp.where, fresh), open_eyes(pictures), state)
+        state, u, FF = jax.vmap(see_all, in_axes=(None, 0, 0))(candidates, opened, pictures)
+        return state, (u, FF)
 
-    poses = (record.time, record.position, record.quaternion)
-    return rollout.deal(walk, arenas, jax.tree.map(jnp.asarray, poses))
+    def crowd(rooms: arena.Arena, rows: tuple[Array, ...]):
+        dark = jnp.zeros((len(rows[0]), *camera.shape(eyes)))
+        return rollout.march(partial(jax.vmap(frame), rooms), jax.vmap(open_eyes)(dark), rows)[1]
+
+    rows = (record.fresh, record.time, record.position, record.quaternion)
+    return rollout.deal(crowd, arenas, jax.tree.map(jnp.asarray, rows))
 
 
 def choose(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: Candidates) -> Choice:

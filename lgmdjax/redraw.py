@@ -45,10 +45,13 @@ def _frames(
     Where the compiler knows more, it computes what it can beforehand, and comes to other last bits.
     """
 
-    def robot(room: arena.Arena, *poses: Leaf) -> Array:
-        return jax.lax.map(lambda pose: frame(eyes, room, *pose, draw=draw), poses)
+    def crowd(rooms: arena.Arena, *poses: Leaf) -> Array:
+        def look(_: None, poses: tuple[Leaf, Leaf, Leaf]) -> tuple[None, Array]:
+            return None, jax.vmap(lambda room, *pose: frame(eyes, room, *pose, draw=draw))(rooms, *poses)
 
-    return rollout.deal(robot, rooms, *poses)
+        return rollout.march(look, None, poses)[1]
+
+    return rollout.deal(crowd, rooms, *poses)
 
 
 def frame(

@@ -1,7 +1,8 @@
 """Many frames, many robots: the one place that scans, maps and jits a walk.
 
-`walk` is a `lax.scan` of `simulation.step`, `advance` runs it for a batch of rooms, and `chunks` does so for a few
-seconds of robot time at once, so that a host can show progress, write what came, and be interrupted between two.
+`walk` is a `lax.scan` of `simulation.step` for one robot, `advance` one of a `vmap` of it for a batch of rooms, and
+`chunks` does that for a few seconds of robot time at once, so that a host can show progress, write what came, and be
+interrupted between two.
 
 The robots of a batch are dealt out to the devices. A core of a CPU is one if `JAX_NUM_CPU_DEVICES` says so before JAX
 starts, as the command line does: a body is many small sums in a row, which cores cannot share, but robots are apart.
@@ -44,7 +45,7 @@ def walk(
 @partial(jax.jit, static_argnames="driver")
 def start(params: Params, model: mjx.Model, rooms: Room, *, driver: Driver) -> State:
     """Put one robot into each room of a batch."""
-    return deal(lambda room: simulation.init(params, model, room, driver), rooms)
+    return deal(jax.vmap(lambda room: simulation.init(params, model, room, driver)), rooms)
 
 
 @partial(jax.jit, static_argnames=("driver", "frames"), donate_argnames="states")
@@ -59,16 +60,39 @@ def advance(
     draw: Bool[Array, ""] | bool,
 ) -> tuple[State, Record]:
     """Walk a batch of robots, each in its own room; the record's axes are (robot, frame)."""
-    return deal(lambda room, state: walk(params, model, room, state, driver, frames, draw), rooms, states)
+
+    def step(room: Room, state: State) -> tuple[State, Record]:
+        return simulation.step(params, model, room, state, driver, draw)
+
+    def crowd(rooms: Room, states: State) -> tuple[State, Record]:
+        return march(lambda states, _: jax.vmap(step)(rooms, states), states, length=frames)
+
+    return deal(crowd, rooms, states)
 
 
-def deal(one: Callable[..., Any], *batches: Any) -> Any:
-    """Map a function of one robot over batches of robots, dealt out to `shares` devices."""
+def march(
+    frame: Callable[[Any, Any], tuple[Any, Any]], states: Any, series: Any = None, length: int | None = None
+) -> tuple[Any, Any]:
+    """Scan over frames a function of a whole crowd; `series` and what comes out have axes (robot, frame).
+
+    A `vmap` of a `lax.scan` gives the same, but JAX traces the body of the loop some more times then, to find out
+    what differs between robots: for a whole walk twice as long in all.
+    """
+    states, out = jax.lax.scan(frame, states, _swapped(series), length=length)
+    return states, _swapped(out)
+
+
+def _swapped(series: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), series)
+
+
+def deal(crowd: Callable[..., Any], *batches: Any) -> Any:
+    """Call a function of a crowd with batches of robots, dealt out to `shares` devices."""
     robots = jax.tree.leaves(batches)[0].shape[0]
     mesh = Mesh(np.asarray(jax.local_devices()[: shares(robots)]), ("robots",))
     each = PartitionSpec("robots")
     # Unchecked: nothing passes between robots, and MJX starts its loops with constants, which the check refuses.
-    return jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
+    return jax.shard_map(crowd, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
 
 
 def shares(robots: int) -> int:

@@ -22,7 +22,7 @@ from flax import struct
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from lgmdjax import cpg, hexapod, shaping
+from lgmdjax import cpg, hexapod, rollout, shaping
 from lgmdjax.simulation import FRAME_RATE, SUBSTEPS
 from lgmdjax.trials import yaws
 
@@ -71,8 +71,8 @@ def _walk(model: mjx.Model, courses: Float[Array, "walks steps 6 3"]):
         data = hexapod.substep(model, data, angles)
         return data, (hexapod.pose(data), hexapod.feet(data))
 
-    start = hexapod.reset(model, jnp.zeros(3))
-    return jax.vmap(lambda course: jax.lax.scan(step, start, course)[1])(courses)
+    starts = jax.vmap(lambda _: hexapod.reset(model, jnp.zeros(3)))(courses)
+    return rollout.march(jax.vmap(step), starts, courses)[1]
 
 
 def walk_mjx(model: mjx.Model, courses: Float[Array, "walks steps 6 3"]) -> list[Course]:
