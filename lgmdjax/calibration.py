@@ -72,7 +72,10 @@ def grid(thresholds: Sequence[float] = THRESHOLDS, inhibitions: Sequence[float] 
 def survey(
     params: lgmd.Params, eyes: camera.Params, arenas: arena.Arena, record: Record, candidates: Candidates
 ) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
-    """Draw what recorded walks saw once more, and return u for every candidate, the gate open, and FF, of both eyes."""
+    """Draw what recorded walks saw once more, and return u for every candidate, the gate open, and FF, of both eyes.
+
+    The eyes open on the first picture, and anew wherever the robot was put down.
+    """
 
     def see(candidate: Candidates, state: lgmd.State, picture: Array) -> tuple[lgmd.State, Array, Array]:
         chosen = {"threshold": candidate.threshold, "inhibition": candidate.inhibition, "suppression": jnp.inf}
@@ -84,19 +87,20 @@ def survey(
 
     open_eyes = jax.vmap(partial(lgmd.init, params))
 
-    def frame(room: arena.Arena, state: lgmd.State, row: tuple[Array, ...]):
+    def step(room: arena.Arena, state: lgmd.State, row: tuple[Array, ...]):
         fresh, *pose = row
         pictures = redraw.frame(eyes, room, *pose)
         opened = jax.tree.map(partial(jnp.where, fresh), open_eyes(pictures), state)
         state, u, FF = jax.vmap(see_all, in_axes=(None, 0, 0))(candidates, opened, pictures)
         return state, (u, FF)
 
-    def crowd(rooms: arena.Arena, rows: tuple[Array, ...]):
-        dark = jnp.zeros((len(rows[0]), *camera.shape(eyes)))
-        return rollout.march(partial(jax.vmap(frame), rooms), jax.vmap(open_eyes)(dark), rows)[1]
+    def work(rooms: arena.Arena, rows: tuple[Array, ...]):
+        shut = jax.vmap(open_eyes)(jnp.zeros((len(rows[0]), *camera.shape(eyes))))
+        return rollout.march(step, rooms, shut, rows)[1]
 
-    rows = (record.fresh, record.time, record.position, record.quaternion)
-    return rollout.deal(crowd, arenas, jax.tree.map(jnp.asarray, rows))
+    fresh = jnp.asarray(record.fresh).at[:, 0].set(True)
+    poses = (record.time, record.position, record.quaternion)
+    return rollout.deal(work, arenas, (fresh, *map(jnp.asarray, poses)))
 
 
 def choose(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: Candidates) -> Choice:
@@ -132,7 +136,7 @@ def _sound(record: Record) -> np.ndarray:
     """Tell which frames are walking that has lasted long enough for the average to be of nothing else."""
     sound = np.asarray(record.ok) & ~np.asarray(record.contact) & ~np.asarray(record.fresh)
     window = round(AVERAGED * FRAME_RATE)
-    # The average is centred; two windows leave a margin for the pictures of the put-down on either side.
+    # The average is centred: half a window on either side would do, and as much again lets the robot find its stride.
     return ndimage.minimum_filter1d(sound.astype(np.uint8), 2 * window + 1, axis=1, mode="constant").astype(bool)
 
 

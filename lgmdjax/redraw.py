@@ -45,13 +45,10 @@ def _frames(
     Where the compiler knows more, it computes what it can beforehand, and comes to other last bits.
     """
 
-    def crowd(rooms: arena.Arena, *poses: Leaf) -> Array:
-        def look(_: None, poses: tuple[Leaf, Leaf, Leaf]) -> tuple[None, Array]:
-            return None, jax.vmap(lambda room, *pose: frame(eyes, room, *pose, draw=draw))(rooms, *poses)
+    def step(room: arena.Arena, _: None, pose: tuple[Leaf, Leaf, Leaf]) -> tuple[None, Array]:
+        return None, frame(eyes, room, *pose, draw=draw)
 
-        return rollout.march(look, None, poses)[1]
-
-    return rollout.deal(crowd, rooms, *poses)
+    return rollout.deal(lambda rooms, *poses: rollout.march(step, rooms, None, poses)[1], rooms, *poses)
 
 
 def frame(

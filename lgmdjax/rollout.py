@@ -1,11 +1,12 @@
-"""Many frames, many robots: the one place that scans, maps and jits a walk.
+"""Many frames, many robots: the one place that scans and maps.
 
-`walk` is a `lax.scan` of `simulation.step` for one robot, `advance` one of a `vmap` of it for a batch of rooms, and
-`chunks` does that for a few seconds of robot time at once, so that a host can show progress, write what came, and be
-interrupted between two.
+`walk` scans `simulation.step` over frames for one robot, `advance` scans and maps it for a batch of rooms, and `chunks`
+does that for a few seconds of robot time at once, so that a host can show progress, write what came, and be
+interrupted between two. `march` scans and maps any step of one robot, for those who look at recorded walks again.
 
-The robots of a batch are dealt out to the devices. A core of a CPU is one if `JAX_NUM_CPU_DEVICES` says so before JAX
-starts, as the command line does: a body is many small sums in a row, which cores cannot share, but robots are apart.
+The robots of a batch are dealt out to the devices (`deal`). A core of a CPU is one if `JAX_NUM_CPU_DEVICES` says so
+before JAX starts, as the command line does: a body is many small sums in a row, which cores cannot share, but robots
+are apart.
 """
 
 from collections.abc import Callable, Iterator
@@ -61,23 +62,29 @@ def advance(
 ) -> tuple[State, Record]:
     """Walk a batch of robots, each in its own room; the record's axes are (robot, frame)."""
 
-    def step(room: Room, state: State) -> tuple[State, Record]:
+    def step(room: Room, state: State, _: None) -> tuple[State, Record]:
         return simulation.step(params, model, room, state, driver, draw)
 
-    def crowd(rooms: Room, states: State) -> tuple[State, Record]:
-        return march(lambda states, _: jax.vmap(step)(rooms, states), states, length=frames)
-
-    return deal(crowd, rooms, states)
+    return deal(lambda rooms, states: march(step, rooms, states, length=frames), rooms, states)
 
 
 def march(
-    frame: Callable[[Any, Any], tuple[Any, Any]], states: Any, series: Any = None, length: int | None = None
+    step: Callable[[Any, Any, Any], tuple[Any, Any]],
+    rooms: Any,
+    states: Any,
+    series: Any = None,
+    *,
+    length: int | None = None,
 ) -> tuple[Any, Any]:
-    """Scan over frames a function of a whole crowd; `series` and what comes out have axes (robot, frame).
+    """Scan `step(room, state, row)` of one robot over frames, mapped over robots; gives the last states and what came.
 
-    A `vmap` of a `lax.scan` gives the same, but JAX traces the body of the loop some more times then, to find out
-    what differs between robots: for a whole walk twice as long in all.
+    `series` and what comes out have axes (robot, frame). A `vmap` of a `lax.scan` gives the same, but JAX traces the
+    body of the loop some more times then, to find out what differs between robots: for a walk twice as long in all.
     """
+
+    def frame(states: Any, rows: Any) -> tuple[Any, Any]:
+        return jax.vmap(step)(rooms, states, rows)
+
     states, out = jax.lax.scan(frame, states, _swapped(series), length=length)
     return states, _swapped(out)
 
@@ -86,13 +93,13 @@ def _swapped(series: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), series)
 
 
-def deal(crowd: Callable[..., Any], *batches: Any) -> Any:
-    """Call a function of a crowd with batches of robots, dealt out to `shares` devices."""
+def deal(work: Callable[..., Any], *batches: Any) -> Any:
+    """Call a function of some robots on each of `shares` devices with its share of the batches."""
     robots = jax.tree.leaves(batches)[0].shape[0]
     mesh = Mesh(np.asarray(jax.local_devices()[: shares(robots)]), ("robots",))
     each = PartitionSpec("robots")
     # Unchecked: nothing passes between robots, and MJX starts its loops with constants, which the check refuses.
-    return jax.shard_map(crowd, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
+    return jax.shard_map(work, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
 
 
 def shares(robots: int) -> int:

@@ -3,7 +3,7 @@
 A frame draws what both eyes see from where the robot stands, scans with the laser, shows the pictures to the
 LGMDs, lets the driver choose a velocity and the rule label the frame, and then runs the rhythm, the servos and
 the body for the physics substeps of 1/30 s. Everything is a pure function of (parameters, room, state): a walk
-is a `lax.scan` over `step`, a crowd a `vmap` of it (`lgmdjax.rollout`).
+is a `lax.scan` over `step`, that of a crowd one over its `vmap` (`lgmdjax.rollout`).
 
 A touch of a wall or an obstacle ends a stretch: the next frame begins with the robot set back at the room's next
 start, as an experimenter would lift it, so that one walk can count several collisions. A robot whose state is

@@ -67,12 +67,12 @@ def targets(
 
 @jax.jit
 def _walk(model: mjx.Model, courses: Float[Array, "walks steps 6 3"]):
-    def step(data: mjx.Data, angles: Array):
+    def step(_: None, data: mjx.Data, angles: Array):
         data = hexapod.substep(model, data, angles)
         return data, (hexapod.pose(data), hexapod.feet(data))
 
     starts = jax.vmap(lambda _: hexapod.reset(model, jnp.zeros(3)))(courses)
-    return rollout.march(jax.vmap(step), starts, courses)[1]
+    return rollout.march(step, None, starts, courses)[1]
 
 
 def walk_mjx(model: mjx.Model, courses: Float[Array, "walks steps 6 3"]) -> list[Course]:

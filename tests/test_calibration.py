@@ -141,7 +141,8 @@ def test_survey_equals_the_detector_run_once_a_candidate():
     arenas = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
     steps = 0.02 * np.arange(8)[:, None] * np.array([[1.0, 0.1, 0.0], [0.9, -0.2, 0.0]])[:, None]
     fresh = np.zeros((2, 8), bool)
-    fresh[:, 0] = fresh[1, 5] = True
+    fresh[0, 0] = fresh[1, 5] = True  # the eyes open on the first picture, whatever is recorded
+    steps[1, 5:] += [-0.5, 0.3, 0.0]
     walk = replace(record(passing(2, 8), fresh=fresh), position=steps + np.array([0.0, 0.0, 0.11]))
     params = lgmd.Params()
     u, feed_forward = calibration.survey(params, eyes, arenas, walk, CANDIDATES)
@@ -152,9 +153,11 @@ def test_survey_equals_the_detector_run_once_a_candidate():
             for k, pair in enumerate(zip(CANDIDATES.threshold, CANDIDATES.inhibition, strict=True)):
                 detector = replace(params, threshold=pair[0], inhibition=pair[1], suppression=1e9)
                 for frame, picture in enumerate(pictures[:, side]):
-                    state = lgmd.init(detector, picture) if fresh[robot, frame] else state
+                    state = lgmd.init(detector, picture) if frame == 0 or fresh[robot, frame] else state
                     state, response = see(detector, state, picture)
                     here = robot, frame, side
                     np.testing.assert_allclose(u[*here, k], response.u, atol=1e-9)
                     np.testing.assert_allclose(feed_forward[here], response.feed_forward, atol=1e-9)
-    assert np.ptp(np.asarray(u)[:, 3:, :, 0]) > 0.001  # there is something to see
+    assert np.all(np.ptp(np.asarray(u)[:, 1:5, :, 0], axis=1) > 0.001)  # there is something to see
+    np.testing.assert_array_equal(u[1, 5], 0.5)
+    assert np.all(feed_forward[1, 4] > 0) and not np.any(feed_forward[1, 5])

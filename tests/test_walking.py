@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference import walking as reference
+from scipy.spatial.transform import Rotation
 
-from lgmdjax import cpg, gait, hexapod, lesson, shaping
+from lgmdjax import cpg, gait, hexapod, lesson, shaping, treadmill
 
 STEP = 1 / 180
 CYCLE = round(cpg.CYCLE_TIME / STEP)
@@ -115,20 +116,13 @@ def test_mjx_walks_as_mujoco_does():
     """The same targets for three seconds: the same way, turn and sway, step for step."""
     model, commands = hexapod.build(hexapod.load()), ((1.0, 1.0), (-1.0, 1.0), (2.0, 2.0))
     courses = jnp.stack([targets(*v, seconds=3.0) for v in commands])
-
-    @jax.jit
-    def walk(course):
-        def step(data, angles):
-            data = hexapod.substep(model, data, angles)
-            return data, (data.qpos[:7], hexapod.feet(data))
-
-        return jax.lax.scan(step, hexapod.reset(model, jnp.zeros(3)), course)[1]
-
-    poses, feet = jax.vmap(walk)(courses)
-    for index, course in enumerate(courses):
+    for walk, course in zip(treadmill.walk_mjx(model, courses), courses, strict=True):
         theirs = reference.walk(course, settled=1.0)
-        ours = reference.measured(np.asarray(poses[index]), np.asarray(feet[index]), STEP, 1.0)
+        turned = Rotation.from_quat(np.repeat(walk.quaternion[:, [1, 2, 3, 0]], 6, axis=0))
+        feet = walk.position[:, None] + turned.apply(walk.feet.reshape(-1, 3)).reshape(walk.feet.shape)
+        ours = reference.measured(np.hstack([walk.position, walk.quaternion]), feet, STEP, 1.0)
         assert ours.speed == pytest.approx(theirs.speed, abs=0.001)
         assert ours.yaw_rate == pytest.approx(theirs.yaw_rate, abs=0.002)
         np.testing.assert_allclose(ours.position, theirs.position, atol=0.001)
+        np.testing.assert_allclose(ours.feet, theirs.feet, atol=0.002)
         np.testing.assert_allclose(ours.yaw, theirs.yaw, atol=0.3)
