@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from lgmdjax import arena, calibration, camera, episodes, lgmd, scales
-from lgmdjax.runs import read_json
+from lgmdjax.files import read_json
 from lgmdjax.simulation import Record
 from lgmdjax.stages import collect, crew
 

@@ -155,7 +155,7 @@ def _field(params: Params, first: int) -> tuple[np.ndarray, ...]:
     high, wide = tile(height * n, _TILE[0] * f, least), tile(columns * n, _TILE[1] * f, 2 * least)
     rows, across = -(-height * n // high), -(-columns * n // wide)
     v, u = np.mgrid[: rows * high, : across * wide] + 0.5
-    pixels = _equidistant(u + n * first - 0.5 * n * params.width, v - 0.5 * n * params.height, f)
+    pixels = equidistant(u + n * first - 0.5 * n * params.width, v - 0.5 * n * params.height, f)
     d, d_u, d_v = (a.reshape(3, rows, high, across, wide) for a in pixels)
     size = min(high, wide)
     parts = d[..., np.linspace(0, wide - size, -(-wide // size)).astype(int)[:, None] + np.arange(size)]
@@ -175,7 +175,7 @@ def tile(length: int, wanted: float, least: int) -> int:
     return min(sizes, key=lambda size: abs(math.log(size / wanted)), default=wanted)
 
 
-def _equidistant(u: np.ndarray, v: np.ndarray, f: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def equidistant(u: np.ndarray, v: np.ndarray, f: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions of the pixels (u, v) from the middle, and their derivatives by u and v."""
     rho = np.maximum(np.hypot(u, v), 1e-9)
     theta = rho / f

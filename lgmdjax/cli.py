@@ -33,6 +33,7 @@ class Pipeline:
     """name of the run folder; <scale>-<seed> if empty"""
 
 
+Name = Literal["testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "white", "corner"]
 Flags = Annotated[Pipeline, tyro.conf.arg(name="")]
 
 
@@ -116,6 +117,32 @@ def watch(
         print(file)
 
 
+def trial(
+    name: Annotated[Name, tyro.conf.Positional],
+    *,
+    driver: Literal["teacher", "learned", "blind", "direct", "random"] = "learned",
+    seed: int = 0,
+    seeds: int | None = None,
+    run: Path | None = None,
+    out: Path = Path("runs/trials"),
+) -> None:
+    """Walk one of the paper's experiments; leave the outcome, the walks, a picture from above and a film.
+
+    Args:
+        name: of the experiment
+        driver: who walks
+        seed: of rooms, textures and starts
+        seeds: how many times; as many as the paper has, or more, if left out
+        run: folder of the run whose robot walks; the trained one that comes along if left out
+        out: the results go into a folder of the trial's name in here
+    """
+    import_physics()
+    from lgmdjax.attempt import attempt
+
+    for file in attempt(name, driver, seed=seed, seeds=seeds, run=run, out=out):
+        print(file)
+
+
 COMMANDS: dict[str, Callable[..., int | None]] = {
     "reproduce": reproduce,
     "fit-gait": fit_gait,
@@ -123,6 +150,7 @@ COMMANDS: dict[str, Callable[..., int | None]] = {
     "train": train,
     "evaluate": evaluate,
     "report": report,
+    "trial": trial,
     "watch": watch,
     "doctor": doctor,
 }

@@ -2,7 +2,7 @@
 
 Every function draws one figure for a page about 18 cm wide, on the Agg canvas and without pyplot, so that no
 window system and no global figure is involved. Left is blue and right is orange throughout, in the palette of
-Okabe & Ito, which stays apart for colour-blind eyes. The file is long because it is nine times the same kind of
+Okabe & Ito, which stays apart for colour-blind eyes. The file is long because it is eleven times the same kind of
 thing: the functions share a style and nothing else.
 
 | figure here    | of the paper | shows                                                   |
@@ -15,6 +15,8 @@ thing: the functions share a style and nothing else.
 | `losses`       | 11           | training and test error of every learner                |
 | `stretch`      | 12           | u, d, the rule's v and the learner's v side by side     |
 | `trajectories` | 13           | walks in a room, with its obstacles                     |
+| `rooms`        | -            | walks in several rooms                                  |
+| `passages`     | 14, 16       | ways past what stands in the way                        |
 | `drivers`      | -            | collisions per 100 m of every driver, with intervals    |
 """
 
@@ -375,6 +377,41 @@ def trajectories(arena: Arena | None, walks: Mapping[str, Walks], first: str = "
             axes.spines[:].set_visible(False)
     panels[first].set(xlabel="x [m]", ylabel="y [m]")
     panels[first].legend(loc="upper left", bbox_to_anchor=(0, -0.13), ncols=2, borderaxespad=0)
+    return figure
+
+
+@styled
+def rooms(arenas: Sequence[Arena], walks: Sequence[Walks]) -> Figure:
+    """Draw what was walked in some rooms seen from above, side by side, touches marked."""
+    rows = (len(arenas) + 2) // 3
+    figure = Figure(figsize=(WIDTH, 0.3 + 2.4 * rows))
+    panels = np.asarray(figure.subplots(rows, min(len(arenas), 3), squeeze=False)).ravel()
+    for axes, arena, walk in zip(panels, arenas, walks, strict=False):
+        draw_room(axes, arena)
+        draw_walks(axes, walk, colours=PALETTE)
+        axes.set_aspect("equal")
+        axes.grid(False)
+    for axes in panels[len(arenas) :]:
+        axes.remove()
+    return figure
+
+
+@styled
+def passages(
+    arenas: Sequence[Arena], paths: Sequence[Float[ndarray, "_ 2"]], touched: Bool[ndarray, " robots"]
+) -> Figure:
+    """Draw how robots passed what stood in their way (figs. 14 and 16), seen from above; those that touched it red."""
+    figure = Figure(figsize=(WIDTH, 4.2))
+    axes = figure.subplots()
+    for arena in arenas:
+        draw_room(axes, arena)
+    for path, bad in zip(paths, touched, strict=True):
+        axes.plot(*path[::8].T, color=ALARM if bad else LEFT, linewidth=0.9, alpha=0.7, zorder=3)
+        axes.plot(*path[-1], "X" if bad else "o", color=ALARM if bad else LEFT, markersize=4, zorder=4)
+    least, most = (extreme([extreme(path, axis=0) for path in paths], axis=0) for extreme in (np.min, np.max))
+    axes.set(xlim=(least[0] - 0.4, most[0] + 0.8), ylim=(least[1] - 0.8, most[1] + 0.8))
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{np.sum(~touched)} of {len(paths)} got through", aspect="equal")
+    axes.grid(False)
     return figure
 
 

@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 
 from lgmdjax import arena, camera, figures, film, hexapod, scenes
 from lgmdjax.errors import InputError
+from lgmdjax.files import read_arrays, read_json
 from lgmdjax.gait import Gait
-from lgmdjax.runs import read_arrays, read_json
 
 MINUS = "\N{MINUS SIGN}"
 NOMINAL = float(Gait().nominal_velocity)  # m/s, the speed at v = 1

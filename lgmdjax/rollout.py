@@ -94,21 +94,27 @@ def _swapped(series: Any) -> Any:
 
 
 def deal(work: Callable[..., Any], *batches: Any) -> Any:
-    """Call a function of some robots on each of `shares` devices with its share of the batches."""
+    """Call a function of some robots on each of `shares` devices with its share, which the last robot fills up."""
     robots = jax.tree.leaves(batches)[0].shape[0]
-    mesh = Mesh(np.asarray(jax.local_devices()[: shares(robots)]), ("robots",))
+    devices = shares(robots)
+    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("robots",))
     each = PartitionSpec("robots")
     # Unchecked: nothing passes between robots, and MJX starts its loops with constants, which the check refuses.
-    return jax.shard_map(work, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)(*batches)
+    dealt = jax.shard_map(work, mesh=mesh, in_specs=each, out_specs=each, check_vma=False)
+    filler = -robots % devices
+    if not filler:
+        return dealt(*batches)
+    rows = np.minimum(np.arange(robots + filler, dtype=np.int32), robots - 1)
+    results = dealt(*jax.tree.map(lambda leaf: leaf[rows], batches))
+    return jax.tree.map(lambda leaf: leaf[:robots], results)
 
 
 def shares(robots: int) -> int:
-    """Count the devices that a crowd is dealt out to: as many as share it evenly, two robots or more to each.
+    """Count the devices that a crowd is dealt out to: all, if two robots or more come to each.
 
     A batch of one would be compiled differently, and come to other last bits.
     """
-    even = [n for n in range(1, jax.local_device_count() + 1) if robots % n == 0 and robots > n]
-    return max(even, default=1)
+    return max(min(jax.local_device_count(), robots // 2), 1)
 
 
 def chunks(

@@ -16,16 +16,14 @@ import json
 import os
 import shutil
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lgmdjax import __version__, versions
 from lgmdjax.errors import InputError
+from lgmdjax.files import write_json
 
 FORMAT = 1  # of the run folder; a change makes every stage of an older folder run again
 SEEDS = 2**32  # in single precision JAX keeps no more of a seed: greater ones would be other ones' twins
@@ -108,41 +106,6 @@ def fingerprint(stage: Stage, settings: Any, seed: int, inputs: Mapping[str, str
         "inputs": {name: inputs[name] for name in stage.inputs},
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(partial, path)
-
-
-def read_json(path: Path) -> Any:
-    """Read a JSON file of a run folder; raise `InputError` for a missing or damaged one."""
-    with _named(path):
-        return json.loads(path.read_text(encoding="utf-8"))
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an npz file of a run folder; raise `InputError` for a missing or damaged one."""
-    with _named(path), np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
-
-
-@contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Tell which file could not be read, and the command that makes it."""
-    command = "reproduce" if path.name == "run.json" else path.parent.name.partition(".")[0]
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise InputError(f"expected {path}, found none; run `lgmdjax {command}` first") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(
-            f"expected {path} as `lgmdjax {command}` writes it, got a file that cannot be read ({reason}); "
-            f"delete its folder and run `lgmdjax {command}` again"
-        ) from error
 
 
 def _do(run: Run, stage: Stage, print_: str) -> None:

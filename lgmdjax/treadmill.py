@@ -23,8 +23,8 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from lgmdjax import cpg, hexapod, rollout, shaping
+from lgmdjax.scores import yaws
 from lgmdjax.simulation import FRAME_RATE, SUBSTEPS
-from lgmdjax.trials import yaws
 
 SETTLING = 3.0  # s, left out of every mean
 STEP = 1 / (FRAME_RATE * SUBSTEPS)

@@ -1,141 +1,145 @@
-"""How walks are scored: distance, collisions per 100 m, clearance, each with a 95 % interval.
+"""The paper's experiments as data: where robots start, how long they walk, and when they have got through.
 
-Distance is the path of the trunk's centre, averaged over one gait cycle so that sway does not count, and not
-across the gap when the robot was set back. A collision is a frame in which the least clearance reached zero;
-the robot is then set back, so each touch counts once. Rates of collisions are Poisson counts over a distance;
-their interval is exact (Garwood 1936), and clearances and distances are bootstrapped over robots.
+| trial    | paper             | what stands in the way                                      |
+| -------- | ----------------- | ----------------------------------------------------------- |
+| testing  | fig. 13           | sixteen obstacles, from (0, 2.5)                             |
+| unseen   | -                 | random rooms, one a robot                                    |
+| tube     | fig. 14           | a tube 1.25 m ahead, 0 to 0.42 m to either side              |
+| indoor   | figs. 15a, 16a    | a box ahead, one to the right, a table to the left           |
+| outdoor  | fig. 15b          | trees and bushes on grass, a facade behind                   |
+| dynamic  | figs. 15c, 16b, c | boxes put in the way from the left, then from the right      |
+| white    | sec. 5.4          | a wall without contrast ahead                                |
+| corner   | sec. 5.4          | a corner of two walls ahead                                  |
 
-Works on host records (`rollout.chunks`) with axes (robot, frame).
+In `testing` and `unseen` a robot that touches something is set back and walks on: collisions are counted per 100 m
+(`lgmdjax.scores`). The others ask whether it got through untouched, up to the frame in which it had passed what
+stood in its way, had turned back, or had walked for long enough.
+
+A seed draws textures, by a key of its own that no training room has, and where exactly the robot is put down: within
+a centimetre, and two degrees. With half the seeds the room is mirrored.
 """
 
-from collections.abc import Iterator
-from itertools import pairwise
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from scipy import ndimage, stats
+from jaxtyping import Array
 
-from lgmdjax.errors import InputError
-from lgmdjax.simulation import FRAME_RATE, Record
+from lgmdjax import arena, rollout, scenes
+from lgmdjax.scores import Estimate, wilson, yaws
+from lgmdjax.simulation import Record, Room
 
-CONFIDENCE = 0.95
-
-
-@struct.dataclass(kw_only=True)
-class Estimate:
-    """A number and the interval that holds it at 95 %."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
+LATERALS = tuple(round(0.03 * k, 2) for k in range(15))  # d_y of fig. 14 [m]
+TUBE = 1.25  # d_x of fig. 14 [m]
+LIBERTY = (0.01, 0.01, np.deg2rad(2.0))  # by how much a start may be off: x, y [m], yaw [rad]
+TURNED_BACK = 0.5 * np.pi  # rad from the first heading
 
 
-@struct.dataclass(kw_only=True)
-class Score:
-    """What one driver did over a set of walks."""
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One experiment; `rooms(key, seeds)` sets up its robots."""
 
-    robots: int
-    lost: int  # robots frozen because they fell or went non-finite
-    distance: float  # m, all together
-    collisions: int
-    per_100_m: Estimate  # collisions per 100 m
-    first_collision: Estimate  # m walked until the first touch, or to the end where there was none
-    clearance: Estimate  # m, the mean over frames of the least clearance in a frame
-    speed: float  # m/s, path length over time
-    turning: float  # rad/s, mean absolute yaw rate
+    name: str
+    figure: str  # of the paper
+    rooms: Callable[[Array, int], Room]
+    seeds: int  # as many as the paper has trials, or more
+    seconds: float  # of walking, at most
+    beyond: float = np.inf  # m, x of the place where the way is free again
+    ends: bool = True  # with the first touch; otherwise the robot is set back and walks on
 
 
-def score(record: Record, cycle_time: float) -> Score:
-    """Score a batch of walks; frames of a robot that is no longer sound count for nothing."""
-    sound = np.asarray(record.ok)
-    touches = np.asarray(record.contact) & sound
-    steps = step_lengths(record, cycle_time)
-    distance, collisions = float(steps.sum()), int(touches.sum())
-    if distance <= 0:
-        raise InputError("expected a walk with some distance in it, got none; did every robot fall at once?")
-    clearance = np.where(sound, record.clearance, np.nan)
-    return Score(
-        robots=len(sound),
-        lost=int((~sound[:, -1]).sum()),
-        distance=distance,
-        collisions=collisions,
-        per_100_m=poisson_rate(collisions, distance / 100),
-        first_collision=bootstrap_mean(_first_collision(steps, touches)),
-        clearance=bootstrap_mean(np.nanmean(clearance, axis=1)),
-        speed=distance * FRAME_RATE / int(sound.sum()),
-        turning=float(np.mean(np.abs(yaw_rates(record, cycle_time))[sound])),
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came of every robot of a trial, until its end."""
+
+    touched: np.ndarray  # something, or was lost
+    frames: np.ndarray  # until the end
+    clearance: np.ndarray  # m, the least
+    retreated: np.ndarray  # it turned back
+
+    def avoided(self) -> Estimate:
+        """Estimate the share of robots that got through, with Wilson's interval."""
+        return wilson(int((~self.touched).sum()), len(self.touched))
+
+
+def judge(trial: Trial, record: Record) -> Outcome:
+    """Find each robot's end of the trial, and what had happened by then; axes (robot, frame)."""
+    x, heading = np.asarray(record.position)[..., 0], np.unwrap(yaws(record.quaternion), axis=1)
+    turned = np.abs(heading - heading[:, :1]) > TURNED_BACK
+    bad = np.asarray(record.contact) | ~np.asarray(record.ok)
+    over = bad | turned | (x > trial.beyond)
+    over[:, -1] = True
+    end = over.argmax(axis=1)
+    at_end = (np.arange(len(end)), end)
+    until = np.arange(x.shape[1]) <= end[:, None]
+    return Outcome(
+        touched=bad[at_end],
+        frames=end + 1,
+        clearance=np.where(until, record.clearance, np.inf).min(axis=1),
+        retreated=(turned & ~bad)[at_end],
     )
 
 
-def step_lengths(record: Record, cycle_time: float) -> np.ndarray:
-    """Measure the way of the smoothed trunk centre from each frame to the next [m], zero across a set-back.
+def _alike(scene: Callable[[Array], arena.Arena]) -> Callable[[Array, int], Room]:
+    """Set up a scene once a seed, every second time mirrored."""
 
-    Shape (robots, frames); the last frame of a stretch has no next one and counts zero.
-    """
-    positions, setbacks = np.asarray(record.position), np.asarray(record.setbacks)
-    sound = np.asarray(record.ok)
-    lengths = np.zeros(setbacks.shape)
-    for robot, first, last in stretches(setbacks):
-        path = _smooth(positions[robot, first:last, :2], cycle_time)
-        lengths[robot, first : last - 1] = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    return np.where(sound, lengths, 0.0)
+    def rooms(key: Array, seeds: int) -> Room:
+        return rollout.stack([_room(scene, jax.random.fold_in(key, n), bool(n % 2)) for n in range(seeds)])
+
+    return rooms
 
 
-def yaw_rates(record: Record, cycle_time: float) -> np.ndarray:
-    """Measure the yaw rate of the trunk, averaged over one gait cycle [rad/s]; shape (robots, frames)."""
-    yaw, setbacks = np.unwrap(yaws(np.asarray(record.quaternion)), axis=1), np.asarray(record.setbacks)
-    rates = np.zeros(yaw.shape)
-    for robot, first, last in stretches(setbacks):
-        if last - first > 1:
-            rates[robot, first:last] = np.gradient(_smooth(yaw[robot, first:last], cycle_time)) * FRAME_RATE
-    return rates
+def _tubes(key: Array, seeds: int) -> Room:
+    """Set up both sides of every lateral distance, `seeds` times."""
+    rooms = [
+        _room(lambda key, d_y=d_y: scenes.tube_scene(d_y, key), jax.random.fold_in(key, n), mirrored)
+        for n in range(seeds)
+        for d_y in LATERALS
+        for mirrored in (False, True)
+    ]
+    return rollout.stack(rooms)
 
 
-def yaws(quaternion: np.ndarray) -> np.ndarray:
-    """Read the heading [rad] off quaternions w x y z."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+def _room(scene: Callable[[Array], arena.Arena], key: Array, mirrored: bool) -> Room:
+    """Build a scene for one robot, put down not quite at its start."""
+    texture_key, start_key, luck = jax.random.split(key, 3)
+    built = scene(texture_key)
+    # In float32, so that a key means the same start at any precision.
+    off = jax.random.uniform(start_key, (3,), jnp.float32, -1.0, 1.0).astype(float)
+    built = replace(built, start=built.start + off * jnp.asarray(LIBERTY))
+    built = arena.mirror(built) if mirrored else built
+    return Room(arena=built, starts=built.start[None], key=luck)
 
 
-def stretches(setbacks: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Yield (robot, first frame, end frame) of every uninterrupted stretch of walking."""
-    for robot, count in enumerate(setbacks):
-        cuts = np.flatnonzero(np.diff(count)) + 1
-        bounds = [0, *cuts.tolist(), len(count)]
-        yield from ((robot, first, last) for first, last in pairwise(bounds))
+def _white(key: Array) -> arena.Arena:
+    white = jnp.asarray([235.0, 0.0, 0.0, 1.0], dtype=float)
+    room = scenes.textured(arena.empty_room((4.0, 4.0)), key)
+    return replace(room, wall_texture=jnp.broadcast_to(white, (4, 4)))
 
 
-def poisson_rate(count: int, exposure: float) -> Estimate:
-    """Estimate a rate from a count over an exposure, with the exact interval (Garwood 1936)."""
-    tail = (1 - CONFIDENCE) / 2
-    low = stats.chi2.ppf(tail, 2 * count) / 2 if count else 0.0
-    high = stats.chi2.ppf(1 - tail, 2 * (count + 1)) / 2
-    return Estimate(value=count / exposure, low=float(low) / exposure, high=float(high) / exposure)
+def _corner(key: Array) -> arena.Arena:
+    return scenes.textured(arena.empty_room((4.0, 4.0), start=(0.0, 0.0, 0.25 * jnp.pi)), key)
 
 
-def bootstrap_mean(values: np.ndarray) -> Estimate:
-    """Estimate a mean over robots, with a percentile bootstrap; one robot alone has no interval (nan)."""
-    values = np.asarray(values)
-    if len(values) < 2:
-        return Estimate(value=float(values.mean()), low=float("nan"), high=float("nan"))
-    if np.ptp(values) == 0:
-        return Estimate(value=float(values[0]), low=float(values[0]), high=float(values[0]))
-    interval = stats.bootstrap(
-        (values,), np.mean, confidence_level=CONFIDENCE, n_resamples=2000, method="percentile", rng=0
-    ).confidence_interval
-    return Estimate(value=float(values.mean()), low=float(interval.low), high=float(interval.high))
-
-
-def _smooth(path: np.ndarray, cycle_time: float) -> np.ndarray:
-    """Average over one gait cycle; the ends repeat, which shortens a stretch by at most half a cycle."""
-    return ndimage.uniform_filter1d(path, round(cycle_time * FRAME_RATE), axis=0, mode="nearest")
-
-
-def _first_collision(steps: np.ndarray, touches: np.ndarray) -> np.ndarray:
-    """Measure each robot's way to its first touch [m]; its whole way where it never touched (a lower bound)."""
-    walked = np.cumsum(steps, axis=1)
-    first = np.where(touches.any(axis=1), touches.argmax(axis=1), touches.shape[1] - 1)
-    return np.take_along_axis(walked, first[:, None], axis=1)[:, 0]
+TRIALS = {
+    trial.name: trial
+    for trial in (
+        Trial(
+            name="testing",
+            figure="13",
+            rooms=lambda key, seeds: rollout.copies(key, scenes.testing_room(), seeds),
+            seeds=5,
+            seconds=800.0,
+            ends=False,
+        ),
+        Trial(name="unseen", figure="-", rooms=rollout.random_rooms, seeds=64, seconds=180.0, ends=False),
+        Trial(name="tube", figure="14", rooms=_tubes, seeds=8, seconds=40.0, beyond=TUBE + 0.4),
+        Trial(name="indoor", figure="15a, 16a", rooms=_alike(scenes.indoor_scene), seeds=12, seconds=60.0, beyond=2.2),
+        Trial(name="outdoor", figure="15b", rooms=_alike(scenes.outdoor_scene), seeds=10, seconds=60.0, beyond=4.0),
+        Trial(name="dynamic", figure="15c, 16b, 16c", rooms=_alike(scenes.dynamic_scene), seeds=10, seconds=60.0),
+        Trial(name="white", figure="sec. 5.4", rooms=_alike(_white), seeds=12, seconds=40.0),
+        Trial(name="corner", figure="sec. 5.4", rooms=_alike(_corner), seeds=12, seconds=50.0),
+    )
+}

@@ -5,10 +5,7 @@ same as a plot; `overlay.mp4`, what the eyes see with the layers E, I and S and 
 """
 
 import json
-import os
-import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import partial
@@ -25,7 +22,7 @@ from jaxtyping import Array, Float, UInt8
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from lgmdjax import __version__, figures, lgmd, overlay, video
+from lgmdjax import __version__, figures, files, lgmd, overlay, video
 from lgmdjax.errors import InputError
 
 LEAST_FRAMES = 3  # inhibition, a frame late, has not been felt before the third
@@ -69,7 +66,7 @@ def watch(
         width, height = _scaled(path, film, eyes)
         _note_rate(film)
         sheet = overlay.lay_out(*_split(np.zeros((height, width), np.uint8), eyes).shape[1:])
-        with _all_or_nothing(place) as folder, _progress(film, width, height) as frames:
+        with files.all_or_nothing(place) as folder, _progress(film, width, height) as frames:
             course, excitations = _look_at_all(frames, sheet, folder / "overlay.mp4", film.rate, eyes, params)
             if len(course) < LEAST_FRAMES:
                 raise InputError(
@@ -205,24 +202,3 @@ def _metadata(path: Path, film: video.Video, eyes: Eyes, params: lgmd.Params) ->
     numbers = {name: float(getattr(params, name)) for name in ("threshold", "suppression", "inhibition")}
     facts = {"units": UNITS, "eyes": asdict(eyes), "lgmd": numbers, "rate": float(film.rate)}
     return {"video": path.name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}
-
-
-@contextmanager
-def _all_or_nothing(folder: Path) -> Iterator[Path]:
-    """Give a place to write to, whose files move into the folder when all of them are there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        work = tempfile.TemporaryDirectory(prefix=".partial-", dir=folder)
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(
-            f"expected a folder that can be written, got {folder} ({reason}); choose another --out"
-        ) from error
-    try:
-        with work:
-            yield Path(work.name)
-            for file in Path(work.name).iterdir():
-                os.replace(file, folder / file.name)
-    finally:
-        with suppress(OSError):  # it holds files of an earlier time
-            folder.rmdir()

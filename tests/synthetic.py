@@ -1,4 +1,4 @@
-"""A run folder as the stages leave it, with made-up but plausible numbers."""
+"""Made-up walks, and a run folder as the stages leave it, with plausible numbers."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lgmdjax import arena
-from lgmdjax.simulation import FRAME_RATE
+from lgmdjax.simulation import FRAME_RATE, Record
 
 DRIVERS = ("teacher", "learned", "blind", "direct", "random")
 RATES = {"teacher": 0.4, "learned": 3.21, "blind": 17.3, "direct": 12.9, "random": 19.8}
@@ -32,6 +32,28 @@ def room() -> arena.Arena:
     )
 
 
+def walk(robots: int = 2, frames: int = 1200, **changes: np.ndarray) -> Record:
+    """Robots that walk straight at 0.05 m/s, swaying 2 cm sideways once in a gait cycle of a second."""
+    time = np.arange(frames) / FRAME_RATE
+    position = np.zeros((robots, frames, 3))
+    position[..., 0] = 0.05 * time
+    position[..., 1] = 0.02 * np.sin(2 * np.pi * time)
+    fields = {
+        "time": np.broadcast_to(time, (robots, frames)),
+        "position": position,
+        "quaternion": np.broadcast_to([1.0, 0, 0, 0], (robots, frames, 4)),
+        "joints": np.zeros((robots, frames, 6, 3)),
+        **{name: np.zeros((robots, frames, 2)) for name in ("u", "feed_forward", "excitation")},
+        **{name: np.zeros((robots, frames, 2)) for name in ("distances", "label", "velocity")},
+        "clearance": np.full((robots, frames), 0.3),
+        "contact": np.zeros((robots, frames), bool),
+        "fresh": np.zeros((robots, frames), bool),
+        "setbacks": np.zeros((robots, frames), int),
+        "ok": np.ones((robots, frames), bool),
+    }
+    return Record(**(fields | changes))
+
+
 def walks(generator: np.random.Generator, robots: int, frames: int) -> dict[str, np.ndarray]:
     """Wandering paths of 0.06 m/s from (0, 2.5), set back once, halfway, after a touch by robot 0."""
     turning = np.cumsum(generator.normal(0, 0.02, (robots, frames)), axis=1)
@@ -46,7 +68,7 @@ def walks(generator: np.random.Generator, robots: int, frames: int) -> dict[str,
 
 
 def score(rate: float) -> dict:
-    """A score as `trials.score` gives it, as JSON."""
+    """A score as `scores.score` gives it, as JSON."""
 
     def estimate(value: float) -> dict[str, float]:
         return {"value": value, "low": 0.7 * value, "high": 1.4 * value}

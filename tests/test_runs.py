@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import lgmdjax
-from lgmdjax import runs
+from lgmdjax import files
 from lgmdjax.errors import InputError
 from lgmdjax.runs import Run, Stage, execute, open_run
 
@@ -250,12 +250,12 @@ def test_damaged_files_of_a_stage_are_named(tmp_path: Path) -> None:
     stage.mkdir()
     (stage / "a.json").write_text('{"threshold": ')
     np.savez(stage / "b.npz", gain=1.0)
-    assert runs.read_arrays(stage / "b.npz")["gain"] == 1.0
+    assert files.read_arrays(stage / "b.npz")["gain"] == 1.0
     (stage / "b.npz").write_bytes((stage / "b.npz").read_bytes()[:-20])
     for read, name, found in (
-        (runs.read_json, "a.json", "cannot be read"),
-        (runs.read_arrays, "b.npz", "cannot be read"),
-        (runs.read_json, "none.json", "none"),
+        (files.read_json, "a.json", "cannot be read"),
+        (files.read_arrays, "b.npz", "cannot be read"),
+        (files.read_json, "none.json", "none"),
     ):
         with pytest.raises(InputError, match=f"expected .*{name}.*{found}.*`lgmdjax collect`"):
             read(stage / name)

@@ -1,89 +1,79 @@
-"""Scores of walks whose answer is known by hand, and intervals against published tables and simulation."""
+"""The paper's experiments: what robots are put before, and how it is judged whether they got through."""
 
+import jax
 import numpy as np
 import pytest
+from synthetic import walk
 
-from lgmdjax import trials
-from lgmdjax.errors import InputError
-from lgmdjax.simulation import Record
+from lgmdjax import arena, scenes, trials
 
-CYCLE = 1.0
-SPEED = 0.05
-FRAMES = 1200
-
-
-def walk(robots: int = 2, **changes: np.ndarray) -> Record:
-    """Robots that walk straight at 0.05 m/s for 40 s, swaying 2 cm sideways once a gait cycle."""
-    time = np.arange(FRAMES) / 30.0
-    position = np.zeros((robots, FRAMES, 3))
-    position[..., 0] = SPEED * time
-    position[..., 1] = 0.02 * np.sin(2 * np.pi * time / CYCLE)
-    fields = {
-        "time": np.broadcast_to(time, (robots, FRAMES)),
-        "position": position,
-        "quaternion": np.broadcast_to([1.0, 0, 0, 0], (robots, FRAMES, 4)),
-        "joints": np.zeros((robots, FRAMES, 6, 3)),
-        **{name: np.zeros((robots, FRAMES, 2)) for name in ("u", "feed_forward", "excitation")},
-        **{name: np.zeros((robots, FRAMES, 2)) for name in ("distances", "label", "velocity")},
-        "clearance": np.full((robots, FRAMES), 0.3),
-        "contact": np.zeros((robots, FRAMES), bool),
-        "fresh": np.zeros((robots, FRAMES), bool),
-        "setbacks": np.zeros((robots, FRAMES), int),
-        "ok": np.ones((robots, FRAMES), bool),
-    }
-    return Record(**(fields | changes))
+KEY = jax.random.key(8)
+SCENES = ("tube", "indoor", "outdoor", "dynamic", "white", "corner")
+TUBE = trials.TRIALS["tube"]
 
 
-def test_sway_does_not_count_as_distance():
-    result = trials.score(walk(), CYCLE)
-    assert result.distance == pytest.approx(2 * SPEED * FRAMES / 30, rel=0.02)
-    assert result.speed == pytest.approx(SPEED, rel=0.02)
+@pytest.fixture(scope="module")
+def rooms():
+    return {name: trials.TRIALS[name].rooms(KEY, 2) for name in SCENES}
 
 
-def test_setback_is_not_walked_and_a_touch_counts_once():
-    record = walk(1)
-    contact, setbacks, position = (np.array(x) for x in (record.contact, record.setbacks, record.position))
-    contact[0, 600] = True
-    setbacks[0, 601:] = 1
-    position[0, 601:, 0] += 3.0  # lifted 3 m ahead
-    result = trials.score(walk(1, contact=contact, setbacks=setbacks, position=position), CYCLE)
-    assert result.collisions == 1
-    assert result.distance == pytest.approx(SPEED * FRAMES / 30, rel=0.05)
-    assert result.first_collision.value == pytest.approx(SPEED * 20, rel=0.05)
-    assert result.per_100_m.value == pytest.approx(100 / result.distance)
+@pytest.mark.parametrize("name", SCENES)
+def test_rooms_are_sound_and_starts_nearly_where_the_paper_has_them(rooms, name):
+    batch = rooms[name]
+    arena.validate(batch.arena)
+    np.testing.assert_array_equal(batch.starts[:, 0], batch.arena.start)
+    meant = np.array([0, 0, np.pi / 4 if name == "corner" else 0])
+    assert np.all(np.abs(np.abs(batch.arena.start) - meant) <= np.array(trials.LIBERTY) + 1e-12)
+    assert len(np.unique(batch.arena.start[:, 0])) > 1
 
 
-def test_lost_robot_counts_for_nothing_after_it_fell():
-    ok = np.ones((2, FRAMES), bool)
-    ok[1, 300:] = False
-    contact = np.zeros((2, FRAMES), bool)
-    contact[1, 900] = True
-    result = trials.score(walk(2, ok=ok, contact=contact), CYCLE)
-    assert (result.lost, result.collisions) == (1, 0)
-    assert result.distance == pytest.approx(SPEED * (40 + 10), rel=0.02)
+def test_tube_stands_at_fifteen_distances_to_either_side(rooms):
+    tubes = np.asarray(rooms["tube"].arena.cylinders.centre)[:, 0]
+    assert tubes.shape == (2 * 15 * 2, 2)
+    np.testing.assert_allclose(tubes[:, 0], 1.25)
+    sides = tubes[:, 1].reshape(2, 15, 2)
+    np.testing.assert_allclose(sides[..., 0], [np.linspace(0, 0.42, 15)] * 2, atol=1e-12)
+    np.testing.assert_allclose(sides[..., 1], -sides[..., 0])
 
 
-def test_walk_without_distance_is_an_input_error():
-    with pytest.raises(InputError, match="distance"):
-        trials.score(walk(1, ok=np.zeros((1, FRAMES), bool)), CYCLE)
+def test_every_second_room_is_a_mirror_image(rooms):
+    assert rooms["indoor"].arena.handedness.tolist() == [1, -1]
+    table = np.asarray(rooms["indoor"].arena.boxes.centre)[:, 2]
+    np.testing.assert_allclose(table[0] * [1, -1], table[1])
 
 
-@pytest.mark.parametrize(("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.390)])
-def test_poisson_interval_matches_the_published_table(count, low, high):
-    """Garwood's limits as tabulated, for example, in Ulm (1990)."""
-    estimate = trials.poisson_rate(count, 1.0)
-    assert (estimate.low, estimate.high) == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=1e-3))
+@pytest.mark.parametrize("name", SCENES)
+def test_no_texture_is_one_of_the_training_room(rooms, name):
+    known = np.asarray(scenes.training_room().boxes.texture)
+    seen = np.asarray(rooms[name].arena.boxes.texture).reshape(-1, 4)
+    assert not np.any(np.all(np.isclose(seen[:, None], known[None]), axis=-1))
 
 
-def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
-    rng = np.random.default_rng(0)
-    intervals = [trials.bootstrap_mean(rng.exponential(1.0, 40)) for _ in range(100)]
-    covered = sum(interval.low <= 1.0 <= interval.high for interval in intervals)
-    assert 82 <= covered <= 100
+def test_a_robot_that_passes_has_got_through_whatever_it_touches_later():
+    """At 0.05 m/s it has passed the tube, by 0.4 m, after 33 s of 40."""
+    contact = np.zeros((2, 1200), bool)
+    contact[0, 1100], contact[1, 500] = True, True
+    clearance = np.full((2, 1200), 0.3)
+    clearance[0, 700], clearance[0, 1100], clearance[1, 500] = 0.1, 0.0, -0.01
+    outcome = trials.judge(TUBE, walk(contact=contact, clearance=clearance))
+    assert outcome.touched.tolist() == [False, True]
+    assert outcome.frames.tolist() == [round(1.65 / 0.05 * 30) + 2, 501]
+    np.testing.assert_allclose(outcome.clearance, [0.1, -0.01])
+    assert outcome.avoided().value == 0.5
 
 
-def test_yaw_rate_of_a_turning_robot():
-    yaw = np.broadcast_to(0.2 * np.arange(FRAMES) / 30.0, (1, FRAMES))
+def test_a_robot_that_turns_back_has_retreated_and_one_that_is_lost_has_not_got_through():
+    yaw = np.zeros((2, 1200))
+    yaw[0] = np.linspace(0, 3.0, 1200)
+    ok = np.ones((2, 1200), bool)
+    ok[1, 600:] = False
     quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
-    rates = trials.yaw_rates(walk(1, quaternion=quaternion), CYCLE)
-    assert np.allclose(rates[0, 60:-60], 0.2, atol=1e-3)
+    outcome = trials.judge(TUBE, walk(quaternion=quaternion, ok=ok))
+    assert outcome.retreated.tolist() == [True, False]
+    assert outcome.touched.tolist() == [False, True]
+    assert outcome.frames[0] == pytest.approx(1199 * np.pi / 2 / 3.0, abs=2)
+
+
+def test_a_robot_that_stays_out_is_judged_at_the_end():
+    outcome = trials.judge(TUBE, walk(1, frames=300))
+    assert (outcome.frames.tolist(), outcome.touched.tolist(), outcome.retreated.tolist()) == ([300], [False], [False])

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from lgmdjax import braitenberg, calibration, drivers, episodes, hexapod, lgmd, rollout, scales
-from lgmdjax.runs import read_json, write_json
+from lgmdjax.files import read_json, write_json
 from lgmdjax.stages import crew
 
 CHOSEN = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I

@@ -21,6 +21,9 @@ from lgmdjax import (
     shaping,
     simulation,
 )
+from lgmdjax.files import read_arrays
+
+DATA = Path(__file__).parent.parent / "data"
 
 
 def eyes(settings: scales.Eyes) -> camera.Params:
@@ -32,6 +35,18 @@ def robot(gait: Path, settings: scales.Eyes, detector: lgmd.Params, crew: driver
     """Put a robot together: the gait that was fitted, the eyes of the run, and anyone at the wheel."""
     networks = shaping.load(gait / "shaping.safetensors")
     return simulation.assemble(crew, detector=detector, networks=networks, eyes=eyes(settings))
+
+
+def trained(run: Path | None) -> simulation.Params:
+    """Put the robot of a run together, all five drivers aboard, with the eyes that its navigator learned from.
+
+    Raises InputError if the run has not been trained; None stands for the robot that comes with the package.
+    """
+    gait, train = (run / "fit-gait", run / "train") if run else (DATA, DATA)
+    learned, header = navigator.load(train / "controller.safetensors")
+    baselines = read_arrays(train / "baselines.npz")
+    crew = everyone(learned, float(baselines["gain"]), baselines["replayed"])
+    return robot(gait, scales.Eyes(**header["eyes"]), lgmd.Params(**header["lgmd"]), crew)
 
 
 def everyone(

@@ -24,10 +24,10 @@ from lgmdjax import (
     rollout,
     scales,
     scenes,
+    scores,
     simulation,
-    trials,
 )
-from lgmdjax.runs import read_arrays, write_json
+from lgmdjax.files import read_arrays, write_json
 from lgmdjax.stages import collect, crew
 
 PLACES = ("testing", "unseen")
@@ -46,11 +46,11 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Evaluate, se
         }
         for place in PLACES
     }
-    scores = {
-        place: {name: dataclasses.asdict(trials.score(record, cpg.CYCLE_TIME)) for name, record in records.items()}
+    scored = {
+        place: {name: dataclasses.asdict(scores.score(record, cpg.CYCLE_TIME)) for name, record in records.items()}
         for place, records in walked.items()
     }
-    write_json(folder / "evaluation.json", scores)
+    write_json(folder / "evaluation.json", scored)
     np.savez(folder / "trajectories.npz", allow_pickle=False, **_trajectories(walked))
     shown = _one(walked["testing"]["learned"], _liveliest(walked["testing"]["learned"]))
     np.savez(folder / "walk.npz", allow_pickle=False, **{name: getattr(shown, name) for name in episodes.FIELDS})

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lgmdjax import cpg, gait, hexapod, legs, lesson, scales, shaping, treadmill
-from lgmdjax.runs import write_json
+from lgmdjax.files import write_json
 
 SWEEP = ((1.0, 1.0), (0.5, 0.5), (1.2, 1.2), (2.0, 2.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0))
 DRAWN = ((0.5, 0.5), (1.0, 1.0), (2.0, 2.0))  # fig. 5c

@@ -20,7 +20,7 @@ import numpy as np
 
 from lgmdjax import drivers, episodes, hexapod, lgmd, navigator, rollout, scales, tapes, training
 from lgmdjax.episodes import Walk
-from lgmdjax.runs import write_json
+from lgmdjax.files import write_json
 from lgmdjax.simulation import FRAME_RATE
 from lgmdjax.stages import collect, crew
 
