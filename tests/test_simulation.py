@@ -169,7 +169,16 @@ def test_chunks_of_a_crowd_are_one_walk(walk, put, params, model, room):
     np.testing.assert_allclose(short.label[3], alone.label, atol=1e-8)
 
 
-@pytest.mark.parametrize(("robots", "shares"), [(1, 1), (2, 1), (3, 1), (4, 2), (6, 2), (7, 1)])
-def test_crowds_are_dealt_out_evenly_and_no_robot_is_alone_on_a_device(robots, shares):
+@pytest.mark.parametrize(("robots", "shares"), [(1, 1), (2, 1), (3, 1), (4, 2), (5, 2), (6, 2)])
+def test_crowds_are_dealt_out_and_no_robot_is_alone_on_a_device(robots, shares):
     assert jax.local_device_count() == 2
     assert rollout.shares(robots) == shares
+
+
+@pytest.mark.parametrize("robots", [1, 3, 4, 5])
+def test_a_crowd_that_does_not_come_out_even_is_filled_up_and_cut(robots):
+    numbers, keys = jnp.arange(robots), jax.random.split(jax.random.key(0), robots)
+    dealt = jax.jit(lambda *batches: rollout.deal(lambda n, key: (n**2, jax.random.uniform(key)), *batches))
+    squares, luck = dealt(numbers, keys)
+    np.testing.assert_array_equal(squares, np.arange(robots) ** 2)
+    np.testing.assert_array_equal(luck, jax.vmap(jax.random.uniform)(keys))
