@@ -1,56 +1,72 @@
 """`lgmdjax trial`: one of the paper's experiments with one driver, walked, judged, drawn and filmed.
 
-Leaves, in a folder of the trial's, the driver's and the seed's name: `outcome.json`, `chunk-00000.parquet` (the
-walks, see `lgmdjax.episodes`), `paths.png` (from above) and `walk.mp4` (the liveliest stretch of one robot).
+Leaves, in a folder of the trial's, the driver's and the seed's name: `outcome.json`, `chunk-*.parquet` (the walks of
+a crowd each, see `lgmdjax.episodes`), `paths.png` (from above) and `walk.mp4` (the liveliest stretch of one robot).
+Interrupted, the same command carries on with the crowd that it was at.
 """
 
-from dataclasses import asdict, replace
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from lgmdjax import arena, camera, cpg, drivers, episodes, figures, files, film, hexapod, rollout, scores, trials
+from lgmdjax import arena, camera, cpg, drivers, episodes, figures, files, film, hexapod, scores, simulation, trials
 from lgmdjax.errors import InputError
-from lgmdjax.runs import SEEDS
+from lgmdjax.runs import Stage, execute, open_run
 from lgmdjax.simulation import FRAME_RATE, Record, Room
 from lgmdjax.stages import crew
 
 ROOMS = 2**22  # far from the numbers of a run's episodes: these rooms are met nowhere else
 FILM = 15.0  # s
 ROOMS_DRAWN = 6
-FILES = ("outcome.json", "chunk-00000.parquet", "paths.png", "walk.mp4")
+DRIVERS = {driver.name: driver for driver in drivers.ALL}
 
 
-def attempt(name: str, driver: str, *, seed: int, seeds: int | None, run: Path | None, out: Path) -> list[Path]:
-    """Walk a trial and give the files written.
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """What is tried."""
+
+    trial: str
+    driver: str
+    seeds: int
+    robot: str  # digest of all its numbers
+
+
+def attempt(name: str, driver: str, *, seed: int, seeds: int | None, run: Path | None, out: Path) -> Path:
+    """Walk a trial and give the folder of its files.
 
     Args:
         name: of the trial. driver: who walks. seed: of rooms, textures and starts.
         seeds: how often; as often as the trial says if None.
         run: the run folder whose robot walks; the one that comes with the package if None.
-        out: the folder to write a folder into; nothing is written until all is there.
+        out: the folder to write a folder into.
     """
-    if not 0 <= seed < SEEDS:
-        raise InputError(f"expected a seed of 0 to {SEEDS - 1}, got {seed}; choose another --seed")
     if seeds is not None and seeds < 1:
         raise InputError(f"expected one or more --seeds, got {seeds}; leave it out for as many as the paper has")
-    trial, wheel = trials.TRIALS[name], {driver.name: driver for driver in drivers.ALL}[driver]
     robot = crew.trained(run)
-    rooms = trial.rooms(jax.random.fold_in(jax.random.key(seed), ROOMS), seeds or trial.seeds)
-    looks = wheel in (drivers.LEARNED, drivers.DIRECT)
-    with files.all_or_nothing(out / f"{name}-{driver}-{seed}") as folder:
-        walks = crew.walks(
-            crew.seat(robot, wheel), hexapod.build(), rooms, trial.seconds, f"{name}: {driver}", draw=looks
-        )
-        record = rollout.together(list(walks))
-        facts = {"trial": name, "driver": driver, "run": "" if run is None else run.name}
-        episodes.Writer(folder, facts).write(record, episode=0, rooms=range(len(record.time)), seed=seed)
-        files.write_json(folder / "outcome.json", summary(trial, record))
-        (folder / "paths.png").write_bytes(figures.to_png(_draw(trial, rooms, record)))
-        _film(folder / "walk.mp4", robot.camera, rooms, record)
-    return [out / f"{name}-{driver}-{seed}" / file for file in FILES]
+    tried = Attempt(trial=name, driver=driver, seeds=seeds or trials.TRIALS[name].seeds, robot=_digest(robot))
+    place = open_run(out, f"{name}-{driver}-{seed}", "trial", seed, {"trial": tried})
+    return execute(place, (Stage(name="trial", work=partial(_work, robot)),), "trial")
+
+
+def walk(folder: Path, tried: Attempt, robot: simulation.Params, seed: int) -> tuple[Room, Record]:
+    """Walk a trial crowd by crowd, after those that are there already; give its rooms and all walks."""
+    trial, driver = trials.TRIALS[tried.trial], DRIVERS[tried.driver]
+    rooms = trial.rooms(jax.random.fold_in(jax.random.key(seed), ROOMS), tried.seeds)
+    writer = episodes.Writer(folder, asdict(tried))
+    looks = driver in (drivers.LEARNED, drivers.DIRECT)
+    label = f"{tried.trial}: {tried.driver}"
+    walks = crew.crowds(
+        crew.seat(robot, driver), hexapod.build(), rooms, trial.seconds, label, draw=looks, done=writer.chunks
+    )
+    for numbers, record in walks:
+        writer.write(record, episode=writer.chunks, rooms=numbers, seed=seed)
+    return rooms, episodes.batched(episodes.read(folder))
 
 
 def summary(trial: trials.Trial, record: Record) -> dict[str, Any]:
@@ -68,7 +84,7 @@ def summary(trial: trials.Trial, record: Record) -> dict[str, Any]:
     }
 
 
-def _draw(trial: trials.Trial, rooms: Room, record: Record) -> figures.Figure:
+def draw(trial: trials.Trial, rooms: Room, record: Record) -> figures.Figure:
     """Draw what was walked, from above, every room the way round that the paper has it."""
     arenas = [jax.tree.map(lambda leaf, robot=robot: leaf[robot], rooms.arena) for robot in range(len(record.time))]
     hands = np.asarray(rooms.arena.handedness)
@@ -76,7 +92,8 @@ def _draw(trial: trials.Trial, rooms: Room, record: Record) -> figures.Figure:
     upright = [arena.mirror(room) if hand < 0 else room for room, hand in zip(arenas, hands, strict=True)]
     if not trial.ends:
         drawn = upright[:ROOMS_DRAWN]
-        walks = [figures.Walks(*(x[[k]] for x in (paths, record.setbacks, record.contact))) for k in range(len(drawn))]
+        series = paths, np.asarray(record.setbacks), np.asarray(record.contact)
+        walks = [figures.Walks(*(x[[k]] for x in series)) for k in range(len(drawn))]
         return figures.rooms(drawn, walks)
     outcome = trials.judge(trial, record)
     return figures.passages(
@@ -84,9 +101,24 @@ def _draw(trial: trials.Trial, rooms: Room, record: Record) -> figures.Figure:
     )
 
 
+def _work(robot: simulation.Params, folder: Path, inputs: Mapping[str, Path], tried: Attempt, seed: int) -> None:
+    trial = trials.TRIALS[tried.trial]
+    rooms, record = walk(folder, tried, robot, seed)
+    files.write_json(folder / "outcome.json", summary(trial, record))
+    (folder / "paths.png").write_bytes(figures.to_png(draw(trial, rooms, record)))
+    _film(folder / "walk.mp4", robot.camera, rooms, record)
+
+
 def _film(target: Path, eyes: camera.Params, rooms: Room, record: Record) -> None:
     """Film the robot that turned most."""
-    liveliest = int(np.argmax(np.abs(np.diff(record.velocity, axis=-1)).mean(axis=(1, 2)) * record.ok[:, -1]))
-    walk = film.Walk(*(np.asarray(getattr(record, name))[liveliest] for name in film.Walk._fields))
+    turning = np.abs(np.diff(record.velocity, axis=-1)).mean(axis=(1, 2))
+    liveliest = int(np.argmax(turning * np.asarray(record.ok)[:, -1]))
+    shown = film.Walk(*(np.asarray(getattr(record, name))[liveliest] for name in film.Walk._fields))
     room = jax.tree.map(lambda leaf: leaf[liveliest], rooms.arena)
-    film.write(target, walk, room, replace(eyes, overlap=1.0), FILM, eyes.overlap)
+    film.write(target, shown, room, replace(eyes, overlap=1.0), FILM, eyes.overlap)
+
+
+def _digest(robot: simulation.Params) -> str:
+    """Tell this robot from any other."""
+    leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(robot)]
+    return hashlib.sha256(b"".join(leaves) + repr(robot.camera).encode()).hexdigest()[:16]

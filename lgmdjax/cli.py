@@ -139,8 +139,7 @@ def trial(
     import_physics()
     from lgmdjax.attempt import attempt
 
-    for file in attempt(name, driver, seed=seed, seeds=seeds, run=run, out=out):
-        print(file)
+    print(f"look into {attempt(name, driver, seed=seed, seeds=seeds, run=run, out=out)}")
 
 
 COMMANDS: dict[str, Callable[..., int | None]] = {

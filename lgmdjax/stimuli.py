@@ -20,33 +20,33 @@ from functools import lru_cache
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from lgmdjax import camera, texture
 
 DARK, BRIGHT = 40.0, 160.0  # grey
 PANORAMA = (120.0, 0.5, 0.0, 0.4)  # texture row of the surroundings that turn: on a sphere of radius 1
 
+Scalar = Float[Array, ""] | float
 Picture = Float[Array, "height width"]
 
 
-def approach(eyes: camera.Params, ratio: ArrayLike, time: ArrayLike) -> Picture:
+def approach(eyes: camera.Params, ratio: Scalar, time: Scalar) -> Picture:
     """Show a dark square that comes straight at the eye with l/|v| = `ratio` [s], until it is everywhere at t = 0."""
     half_angle = jnp.arctan2(jnp.asarray(ratio, float), jnp.maximum(-jnp.asarray(time, float), 0.0))
     return _square(eyes, half_angle, 0.0)
 
 
-def recession(eyes: camera.Params, ratio: ArrayLike, time: ArrayLike) -> Picture:
+def recession(eyes: camera.Params, ratio: Scalar, time: Scalar) -> Picture:
     """Show the approach backwards: the square leaves at t = 0."""
     return approach(eyes, ratio, -jnp.asarray(time))
 
 
-def translation(eyes: camera.Params, half_angle: ArrayLike, rate: ArrayLike, time: ArrayLike) -> Picture:
+def translation(eyes: camera.Params, half_angle: Scalar, rate: Scalar, time: Scalar) -> Picture:
     """Show a dark square of constant size that goes round the eye at `rate` [rad/s], to the left, ahead at t = 0."""
     return _square(eyes, jnp.asarray(half_angle, float), rate * jnp.asarray(time, float))
 
 
-def grating(eyes: camera.Params, period: ArrayLike, rate: ArrayLike, time: ArrayLike) -> Picture:
+def grating(eyes: camera.Params, period: Scalar, rate: Scalar, time: Scalar) -> Picture:
     """Show upright bars, a sine of `period` [rad], that go round the eye at `rate` [rad/s], to the left."""
     d, _, _ = _directions(eyes)
     turns = (jnp.arctan2(d[1], d[0]) - rate * jnp.asarray(time, float)) / period
@@ -54,19 +54,19 @@ def grating(eyes: camera.Params, period: ArrayLike, rate: ArrayLike, time: Array
     return 0.5 * (DARK + BRIGHT) + 0.5 * (BRIGHT - DARK) * kept * jnp.sin(2.0 * jnp.pi * turns)
 
 
-def yaw(eyes: camera.Params, rate: ArrayLike, time: ArrayLike) -> Picture:
+def yaw(eyes: camera.Params, rate: Scalar, time: Scalar) -> Picture:
     """Show what an eye sees that turns left at `rate` [rad/s] amid far, textured surroundings."""
     return _panorama(eyes, _about_z(rate * jnp.asarray(time, float)))
 
 
-def sway(eyes: camera.Params, amplitude: ArrayLike, period: ArrayLike, time: ArrayLike) -> Picture:
+def sway(eyes: camera.Params, amplitude: Scalar, period: Scalar, time: Scalar) -> Picture:
     """Show what an eye sees that rolls by a sine of `amplitude` [rad] and `period` [s], as a walking trunk does."""
     angle = amplitude * jnp.sin(2.0 * jnp.pi * jnp.asarray(time, float) / period)
     c, s, one, zero = jnp.cos(angle), jnp.sin(angle), jnp.ones_like(angle), jnp.zeros_like(angle)
     return _panorama(eyes, jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3))
 
 
-def _square(eyes: camera.Params, half_angle: Array, azimuth: ArrayLike) -> Picture:
+def _square(eyes: camera.Params, half_angle: Array, azimuth: Scalar) -> Picture:
     """Draw a square that subtends `half_angle` to either side of its middle, at an azimuth and the eye's height."""
     d, _, _ = _directions(eyes)
     x, y, z = _turned(_about_z(-jnp.asarray(azimuth, float)), d)
@@ -79,8 +79,12 @@ def _panorama(eyes: camera.Params, rotation: Float[Array, "3 3"]) -> Picture:
     """Draw far surroundings from an eye that is turned by `rotation`."""
     point, across, down = (_turned(rotation, vectors) for vectors in _directions(eyes))
     pattern = texture.prepare(jnp.asarray(PANORAMA, float))
-    scaled = (tuple(pattern.frequency * x for x in vector) for vector in (point, across, down))
-    return texture.grey(pattern, *scaled, bands=len(texture.WAVES))
+
+    def scaled(vector: texture.Vector) -> texture.Vector:
+        x, y, z = vector
+        return pattern.frequency * x, pattern.frequency * y, pattern.frequency * z
+
+    return texture.grey(pattern, scaled(point), scaled(across), scaled(down), bands=len(texture.WAVES))
 
 
 def _about_z(angle: Array) -> Float[Array, "3 3"]:

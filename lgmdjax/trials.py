@@ -66,7 +66,7 @@ class Outcome:
 
 def judge(trial: Trial, record: Record) -> Outcome:
     """Find each robot's end of the trial, and what had happened by then; axes (robot, frame)."""
-    x, heading = np.asarray(record.position)[..., 0], np.unwrap(yaws(record.quaternion), axis=1)
+    x, heading = np.asarray(record.position)[..., 0], np.unwrap(yaws(np.asarray(record.quaternion)), axis=1)
     turned = np.abs(heading - heading[:, :1]) > TURNED_BACK
     bad = np.asarray(record.contact) | ~np.asarray(record.ok)
     over = bad | turned | (x > trial.beyond)
@@ -110,7 +110,8 @@ def _room(scene: Callable[[Array], arena.Arena], key: Array, mirrored: bool) -> 
     off = jax.random.uniform(start_key, (3,), jnp.float32, -1.0, 1.0).astype(float)
     built = replace(built, start=built.start + off * jnp.asarray(LIBERTY))
     built = arena.mirror(built) if mirrored else built
-    return Room(arena=built, starts=built.start[None], key=luck)
+    # As many starts as other rooms have, so that one program serves all.
+    return Room(arena=built, starts=jnp.tile(built.start, (rollout.STARTS, 1)), key=luck)
 
 
 def _white(key: Array) -> arena.Arena:

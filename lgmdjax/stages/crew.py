@@ -101,5 +101,31 @@ def walks(
             yield chunk
 
 
+def crowds(
+    params: simulation.Params,
+    model: mjx.Model,
+    rooms: simulation.Room,
+    seconds: float,
+    label: str,
+    *,
+    draw: bool = True,
+    done: int = 0,
+) -> Iterator[tuple[list[int], simulation.Record]]:
+    """Walk any number of robots, `CROWD` at once, so that one program serves all; yield their numbers and their walks.
+
+    The last crowd is filled up with its last robot, which is left out again. `done` crowds are skipped.
+    """
+    robots = rooms.starts.shape[0]
+    size = min(CROWD, robots)
+    for first in range(done * size, robots, size):
+        present = list(range(first, min(first + size, robots)))
+        filled = np.minimum(np.arange(first, first + size, dtype=np.int32), robots - 1)
+        some = jax.tree.map(lambda leaf, filled=filled: leaf[filled], rooms)
+        part = f"{label}, {first + 1} to {present[-1] + 1} of {robots}"
+        record = rollout.together(list(walks(params, model, some, seconds, part, draw=draw)))
+        yield present, jax.tree.map(lambda leaf, present=present: leaf[: len(present)], record)
+
+
+CROWD = 16
 CHUNK = 5.0  # s of robot time between two signs of life
 BAR = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"
