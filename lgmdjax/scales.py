@@ -22,11 +22,15 @@ class FitGait:
 
 @dataclass(frozen=True, kw_only=True)
 class Eyes:
-    """Pictures of width x height pixels an eye, of which each LGMD gets the part `overlap` on its side."""
+    """Pictures of width x height pixels an eye, of which each LGMD gets the part `overlap` on its side.
+
+    Its cells look at `pooling` pixels a side: about 6 degrees at every scale.
+    """
 
     width: int
     height: int
     overlap: float = 0.6
+    pooling: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +73,9 @@ class Report:
     video_seconds: float
 
 
-_SMALL, _QUICK, _PAPER = Eyes(width=64, height=48), Eyes(width=80, height=60), Eyes(width=320, height=240)
+_SMALL = Eyes(width=64, height=48, pooling=2)
+_QUICK = Eyes(width=80, height=60, pooling=3)
+_PAPER = Eyes(width=320, height=240, pooling=12)
 
 SCALES: Mapping[Scale, Mapping[str, Any]] = {
     "smoke": {

@@ -54,6 +54,27 @@ def test_equals_the_paper_cell_by_cell(precision, strict):
     assert_equals_reference(0.3 * noise(4, 4, 9))
 
 
+def test_a_pooled_detector_is_that_of_a_coarser_picture(precision, strict):
+    """Blocks of 3 x 3 pixels averaged by hand, then the paper's equations."""
+    frames = 0.1 * noise(6, 27, 36)
+    blocks = frames.reshape(6, 9, 3, 12, 3).mean(axis=(2, 4))
+    expected = reference.lgmd(blocks, 2.0, 30.0)
+    response = watch(lgmd.Params(threshold=2.0, suppression=30.0, pooling=3), jnp.asarray(frames, dtype=float))
+    np.testing.assert_allclose(response.u, [cells["u"] for cells in expected], rtol=1e-4, atol=1e-4)
+    assert np.ptp(response.u) > 0.01
+
+
+def test_pooling_shares_a_picture_evenly_and_keeps_its_mirror_image():
+    """Ten pixels among three cells: the middle one gets two thirds of the fourth and of the seventh."""
+    picture = jnp.asarray(noise(1, 10, 10)[0])
+    cells = lgmd.pool(lgmd.Params(pooling=3), picture)
+    share = np.zeros((3, 10))
+    share[0, :4], share[1, 3:7], share[2, 6:] = (1, 1, 1, 1 / 3), (2 / 3, 1, 1, 2 / 3), (1 / 3, 1, 1, 1)
+    np.testing.assert_allclose(cells, 0.3 * share @ picture @ (0.3 * share).T, rtol=1e-12)
+    np.testing.assert_allclose(lgmd.pool(lgmd.Params(pooling=3), picture[:, ::-1]), cells[:, ::-1], rtol=1e-12)
+    np.testing.assert_allclose(cells.mean(), picture.mean(), rtol=1e-12)
+
+
 @pytest.mark.parametrize("printed", [{"printed_feed_forward": True}, {"printed_gate": True}])
 def test_equals_the_printed_equations_on_request(printed):
     assert_equals_reference(np.concatenate([noise(4, 13, 17), 0.2 * noise(4, 13, 17)]), **printed)
@@ -195,7 +216,7 @@ def test_a_hemifield_that_is_none_is_refused(side, overlap):
 def test_pictures_that_do_not_fit_are_refused():
     params, picture = lgmd.Params(), jnp.zeros((6, 8))
     state = lgmd.init(params, picture)
-    with pytest.raises(InputError, match=r"8 x 6 as before, got 8 x 5.*init again"):
+    with pytest.raises(InputError, match=r"8 x 6 cells as before, got 8 x 5.*init again"):
         lgmd.step(params, state, jnp.zeros((5, 8)))
     with pytest.raises(InputError, match=r"uint8.*astype"):
         lgmd.init(params, jnp.zeros((6, 8), jnp.uint8))

@@ -16,7 +16,7 @@ from lgmdjax import braitenberg, calibration, drivers, episodes, hexapod, lgmd, 
 from lgmdjax.files import read_json, write_json
 from lgmdjax.stages import crew
 
-CHOSEN = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
+CHOSEN = ("threshold", "suppression", "inhibition", "pooling")  # T_s, T_f, W_I, pixels a cell
 CALIBRATION = 2**20  # an episode number beyond any other: its rooms are met nowhere else
 
 
@@ -50,7 +50,8 @@ def load_detector(folder: Path) -> lgmd.Params:
 
 def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any]:
     """Walk the teacher with its eyes shut, draw what it would have seen, and choose the thresholds."""
-    shut = crew.robot(gait, settings.eyes, lgmd.Params(), crew.everyone())
+    detector = lgmd.Params(pooling=settings.eyes.pooling)
+    shut = crew.robot(gait, settings.eyes, detector, crew.everyone())
     rooms = rooms_of(seed, CALIBRATION, settings.robots)
     walks = crew.walks(
         crew.seat(shut, drivers.TEACHER), hexapod.build(), rooms, settings.calibration_seconds, "calibrate", draw=False
@@ -58,9 +59,9 @@ def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any
     record = rollout.together(list(walks))
     candidates = calibration.grid()
     print("calibrate: drawing the walks for all candidates of T_s and W_I", flush=True)
-    u, feed_forward = calibration.survey(lgmd.Params(), crew.eyes(settings.eyes), rooms.arena, record, candidates)
+    u, feed_forward = calibration.survey(detector, crew.eyes(settings.eyes), rooms.arena, record, candidates)
     choice = calibration.choose(record, np.asarray(u), np.asarray(feed_forward), candidates)
-    return dataclasses.asdict(choice) | {"overlap": settings.eyes.overlap}
+    return dataclasses.asdict(choice) | {"overlap": settings.eyes.overlap, "pooling": settings.eyes.pooling}
 
 
 def _parameters(settings: scales.Collect, detector: lgmd.Params) -> dict[str, Any]:

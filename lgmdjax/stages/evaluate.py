@@ -54,7 +54,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Evaluate, se
     np.savez(folder / "trajectories.npz", allow_pickle=False, **_trajectories(walked))
     shown = _one(walked["testing"]["learned"], _liveliest(walked["testing"]["learned"]))
     np.savez(folder / "walk.npz", allow_pickle=False, **{name: getattr(shown, name) for name in episodes.FIELDS})
-    np.savez(folder / "layers.npz", allow_pickle=False, **_layers(detector, shown))
+    np.savez(folder / "layers.npz", allow_pickle=False, **_layers(detector, settings.eyes, shown))
 
 
 def load_drivers(train: Path) -> drivers.Anyone:
@@ -107,13 +107,15 @@ def _liveliest(record: simulation.Record) -> int:
     return int(np.argmax(turning - 1e3 * record.contact.sum(axis=1) - 1e6 * ~record.ok[:, -1]))
 
 
-def _layers(detector: lgmd.Params, walk: simulation.Record) -> dict[str, np.ndarray]:
+def _layers(detector: lgmd.Params, eyes: scales.Eyes, walk: simulation.Record) -> dict[str, np.ndarray]:
     """Draw the frame of a walk that excited its left eye most, whole and at the paper's resolution, with its layers."""
+    fine = camera.Params()
+    detector = dataclasses.replace(detector, pooling=max(detector.pooling * fine.width // eyes.width, 1))
     steady = np.where(np.asarray(walk.setbacks) == walk.setbacks[-1], walk.excitation[:, 0], 0.0)
     last = max(int(np.argmax(steady)), 2)
     frames = jax.tree.map(lambda leaf: np.asarray(leaf)[None, last - 2 : last + 1], walk)
     room = jax.tree.map(lambda leaf: leaf[None], scenes.testing_room())
-    pictures = redraw.walks(camera.Params(), room, frames)[0, :, 0]
+    pictures = redraw.walks(fine, room, frames)[0, :, 0]
     state, _ = lgmd.step(detector, lgmd.init(detector, pictures[0]), pictures[1])
     cells = lgmd.layers(detector, state, pictures[2])
     named = {"E": cells.excitation, "I": cells.inhibition, "S": cells.summation}
