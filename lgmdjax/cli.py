@@ -161,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if list(arguments) == ["--version"]:
         print(f"lgmdjax {__version__}")
         return 0
-    _prepare_jax()
+    prepare_jax()
     try:
         code = tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="lgmdjax", args=arguments, description="A hexapod with the eyes of a locust."
@@ -185,7 +185,7 @@ def _execute(pipeline: Pipeline, target: str) -> Path:
     return execute(run, STAGES, target)
 
 
-def _prepare_jax() -> None:
+def prepare_jax() -> None:
     """Set what JAX reads on import, where the user has not: programs are kept, robots go to all cores, less noise."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
