@@ -130,7 +130,7 @@ def test_numbers_come_from_the_files(source: str):
         "0.0071 m/s where 0.05 is asked",
         "At v = 1 it walks 0.049 m/s where 0.05 is asked",
         "here 5 trials, 235.3 m in all, 8 collisions",
-        "each cell sees 60 % of its eye",
+        "each detector sees 60 % of its eye",
         "37 cm long and 45 cm wide",
         "drift in 25 s",
     ):
