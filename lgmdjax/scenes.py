@@ -200,10 +200,11 @@ def _put(prisms: Prisms, index: Array, prism: Prisms, stands: Bool[Array, ""]) -
 
 
 def textured(arena: Arena, key: Array | None = None) -> Arena:
-    """Draw textures for everything in a room: busy obstacles and walls, a nearly plain floor.
+    """Draw textures for everything in a room: busy obstacles and walls, a floor between nearly plain and busy.
 
-    The LGMD takes nearness from how much moves, so it is told apart from contrast only where things are about
-    equally busy; and the floor, always nearest, would drown what it says of everything else.
+    The LGMD takes nearness from how much moves, so it is told apart from contrast only where things are about equally
+    busy. A floor moves in both eyes alike: it raises u, and hardly touches the difference of the two; but a controller
+    that has met plain floors only takes a lawn for a wall on either side.
     """
     boxes, cylinders = arena.boxes, arena.cylinders
     first, second = boxes.yaw.size, boxes.yaw.size + cylinders.yaw.size
@@ -219,7 +220,7 @@ def textured(arena: Arena, key: Array | None = None) -> Arena:
         boxes=dataclasses.replace(boxes, texture=things[:first]),
         cylinders=dataclasses.replace(cylinders, texture=things[first:]),
         wall_texture=between(draws[second:-2], (120.0, 0.5, 0.0, 0.3), (170.0, 0.7, 2.0 * jnp.pi, 0.6)),
-        floor_texture=between(draws[-2], (110.0, 0.05, 0.0, 0.25), (150.0, 0.12, 2.0 * jnp.pi, 0.45)),
+        floor_texture=between(draws[-2], (110.0, 0.05, 0.0, 0.2), (150.0, 0.5, 2.0 * jnp.pi, 0.5)),
         sky=200.0 + 50.0 * draws[-1, 0],
     )
 
