@@ -34,7 +34,7 @@ def main(run: tyro.conf.Positional[Path], robots: int = 8, overlaps: Sequence[fl
     detector, eyes = collect.load_detector(run / "collect"), crew.eyes(scales.Eyes(**settings["eyes"]))
     walks, numbers = episodes.read(run / "collect" / "episodes"), range(settings["episodes"])
     records = [episodes.batched([walk for walk in walks if walk.episode == number][:robots]) for number in numbers]
-    rooms = [collect.rooms_of(seed, number, settings["robots"]).arena for number in numbers]
+    rooms = [crew.rooms_of(seed, number, settings["robots"]).arena for number in numbers]
     rooms = jax.tree.map(lambda leaf: leaf[:robots], rooms)
     _print_row("overlap", *(f"episode {number}" for number in numbers))
     for overlap in overlaps:

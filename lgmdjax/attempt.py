@@ -5,7 +5,6 @@ a crowd each, see `lgmdjax.episodes`), `paths.png` (from above) and `walk.mp4` (
 Interrupted, the same command carries on with the crowd that it was at.
 """
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -15,13 +14,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from lgmdjax import arena, camera, cpg, drivers, episodes, figures, files, film, hexapod, scores, simulation, trials
+from lgmdjax import arena, camera, cpg, drivers, figures, files, film, scores, simulation, trials
 from lgmdjax.errors import InputError
 from lgmdjax.runs import Stage, execute, open_run
 from lgmdjax.simulation import FRAME_RATE, Record, Room
 from lgmdjax.stages import crew
 
-ROOMS = 2**22  # far from the numbers of a run's episodes: these rooms are met nowhere else
 FILM = 15.0  # s
 ROOMS_DRAWN = 6
 DRIVERS = {driver.name: driver for driver in drivers.ALL}
@@ -29,11 +27,12 @@ DRIVERS = {driver.name: driver for driver in drivers.ALL}
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """What is tried."""
+    """Who walks what, how often, and for how long at most."""
 
     trial: str
     driver: str
     seeds: int
+    seconds: float
     robot: str  # digest of all its numbers
 
 
@@ -48,25 +47,25 @@ def attempt(name: str, driver: str, *, seed: int, seeds: int | None, run: Path |
     """
     if seeds is not None and seeds < 1:
         raise InputError(f"expected one or more --seeds, got {seeds}; leave it out for as many as the paper has")
-    robot = crew.trained(run)
-    tried = Attempt(trial=name, driver=driver, seeds=seeds or trials.TRIALS[name].seeds, robot=_digest(robot))
-    place = open_run(out, f"{name}-{driver}-{seed}", "trial", seed, {"trial": tried})
+    robot = crew.trained(run / "fit-gait", run / "train") if run else crew.trained()
+    trial = trials.TRIALS[name]
+    asked = tried(robot, name, driver, seeds or trial.seeds, trial.seconds)
+    place = open_run(out, f"{name}-{driver}-{seed}", "trial", seed, {"trial": asked})
     return execute(place, (Stage(name="trial", work=partial(_work, robot)),), "trial")
 
 
+def tried(robot: simulation.Params, trial: str, driver: str, seeds: int, seconds: float) -> Attempt:
+    """Say what is tried with a robot."""
+    return Attempt(trial=trial, driver=driver, seeds=seeds, seconds=seconds, robot=crew.digest(robot))
+
+
 def walk(folder: Path, tried: Attempt, robot: simulation.Params, seed: int) -> tuple[Room, Record]:
-    """Walk a trial crowd by crowd, after those that are there already; give its rooms and all walks."""
-    trial, driver = trials.TRIALS[tried.trial], DRIVERS[tried.driver]
-    rooms = trial.rooms(jax.random.fold_in(jax.random.key(seed), ROOMS), tried.seeds)
-    writer = episodes.Writer(folder, asdict(tried))
-    looks = driver in (drivers.LEARNED, drivers.DIRECT)
-    label = f"{tried.trial}: {tried.driver}"
-    walks = crew.crowds(
-        crew.seat(robot, driver), hexapod.build(), rooms, trial.seconds, label, draw=looks, done=writer.chunks
+    """Walk a trial crowd by crowd, after those that are in the folder already; give its rooms and all walks."""
+    rooms = trials.draw_rooms(tried.trial, tried.seeds, seed)
+    record = crew.walked(
+        folder, robot, rooms, tried.seconds, DRIVERS[tried.driver], seed=seed, facts=asdict(tried), label=tried.trial
     )
-    for numbers, record in walks:
-        writer.write(record, episode=writer.chunks, rooms=numbers, seed=seed)
-    return rooms, episodes.batched(episodes.read(folder))
+    return rooms, record
 
 
 def summary(trial: trials.Trial, record: Record) -> dict[str, Any]:
@@ -96,9 +95,9 @@ def draw(trial: trials.Trial, rooms: Room, record: Record) -> figures.Figure:
         walks = [figures.Walks(*(x[[k]] for x in series)) for k in range(len(drawn))]
         return figures.rooms(drawn, walks)
     outcome = trials.judge(trial, record)
-    return figures.passages(
-        upright, [path[:end] for path, end in zip(paths, outcome.frames, strict=True)], outcome.touched
-    )
+    ways = [path[:end] for path, end in zip(paths, outcome.frames, strict=True)]
+    across = np.resize(np.repeat(trial.across, 2), len(ways)) if trial.across else None
+    return figures.passages(upright, ways, outcome.touched, outcome.clearance, across)
 
 
 def _work(robot: simulation.Params, folder: Path, inputs: Mapping[str, Path], tried: Attempt, seed: int) -> None:
@@ -116,9 +115,3 @@ def _film(target: Path, eyes: camera.Params, rooms: Room, record: Record) -> Non
     shown = film.Walk(*(np.asarray(getattr(record, name))[liveliest] for name in film.Walk._fields))
     room = jax.tree.map(lambda leaf: leaf[liveliest], rooms.arena)
     film.write(target, shown, room, replace(eyes, overlap=1.0), FILM, eyes.overlap)
-
-
-def _digest(robot: simulation.Params) -> str:
-    """Tell this robot from any other."""
-    leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(robot)]
-    return hashlib.sha256(b"".join(leaves) + repr(robot.camera).encode()).hexdigest()[:16]

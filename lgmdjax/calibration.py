@@ -145,6 +145,13 @@ def choose(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: 
     return Choice(threshold=best["threshold"], inhibition=best["inhibition"], suppression=suppression, table=table)
 
 
+def follow(record: Record) -> dict[str, float]:
+    """Correlate what the eyes of recorded walks said with nearness, as `choose` does for its candidates."""
+    sound = _sound(record)
+    averaged = ndimage.uniform_filter1d(np.asarray(record.u), round(AVERAGED * FRAME_RATE), axis=1)[sound]
+    return _agreement(averaged, 1 / np.asarray(record.distances)[sound])
+
+
 def _sound(record: Record) -> np.ndarray:
     """Tell which frames are walking that has lasted long enough for the average to be of nothing else."""
     sound = np.asarray(record.ok) & ~np.asarray(record.contact) & ~np.asarray(record.fresh)

@@ -398,11 +398,23 @@ def rooms(arenas: Sequence[Arena], walks: Sequence[Walks]) -> Figure:
 
 @styled
 def passages(
-    arenas: Sequence[Arena], paths: Sequence[Float[ndarray, "_ 2"]], touched: Bool[ndarray, " robots"]
+    arenas: Sequence[Arena],
+    paths: Sequence[Float[ndarray, "_ 2"]],
+    touched: Bool[ndarray, " robots"],
+    clearance: Float[ndarray, " robots"],
+    across: Float[ndarray, " robots"] | None = None,
 ) -> Figure:
-    """Draw how robots passed what stood in their way (figs. 14 and 16), seen from above; those that touched it red."""
-    figure = Figure(figsize=(WIDTH, 4.2))
-    axes = figure.subplots()
+    """Draw how robots passed what stood in their way (figs. 14 and 16), seen from above; those that touched it red.
+
+    Args:
+        arenas: a room a robot. paths: until its end. touched: something.
+        clearance: the least until the end [m].
+        across: how far beside the robot's way the obstacle stood [m]; the clearance is then drawn against it.
+    """
+    figure = Figure(figsize=(WIDTH, 4.2 if across is None else 6.4))
+    axes, *below = np.ravel(
+        figure.subplots(1 if across is None else 2, height_ratios=(2.0, 1.0)[: 1 + (across is not None)])
+    )
     for arena in arenas:
         draw_room(axes, arena)
     for path, bad in zip(paths, touched, strict=True):
@@ -412,6 +424,12 @@ def passages(
     axes.set(xlim=(least[0] - 0.4, most[0] + 0.8), ylim=(least[1] - 0.8, most[1] + 0.8))
     axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{np.sum(~touched)} of {len(paths)} got through", aspect="equal")
     axes.grid(False)
+    for panel in below:
+        for bad, style in ((False, {"color": LEFT, "marker": "o"}), (True, {"color": ALARM, "marker": "X"})):
+            some = touched == bad
+            panel.plot(across[some], 100 * np.maximum(clearance[some], 0), linestyle="none", markersize=4, **style)
+        panel.set(xlabel="obstacle beside the robot's way, d_y [m]", ylabel="least clearance [cm]")
+        panel.set_ylim(bottom=0)
     return figure
 
 

@@ -241,6 +241,20 @@ def yaw(pose: Pose) -> Float[Array, ""]:
     return jnp.arctan2(forward[1], forward[0])
 
 
+def swaying(pose: Pose, factor: Float[Array, ""]) -> Pose:
+    """Multiply the angle by which a pose is tilted, its heading kept: 0 is level. Not differentiable when level."""
+    w, x, y, z = pose.quaternion
+    length = jnp.hypot(w, z)
+    c, s = w / length, z / length  # of half the heading: the pose is a tilt about a level axis, then the heading
+    a, b = c * x + s * y, c * y - s * x
+    size = jnp.hypot(a, b)
+    half = factor * jnp.arctan2(size, length)
+    grown = jnp.where(size > 0, jnp.sin(half) / jnp.where(size > 0, size, 1.0), 0.0)
+    a, b = grown * a, grown * b
+    quaternion = jnp.stack([c * jnp.cos(half), c * a - s * b, c * b + s * a, s * jnp.cos(half)])
+    return Pose(position=pose.position, quaternion=quaternion)
+
+
 def eye_poses(pose: Pose) -> tuple[Float[Array, "2 3"], Float[Array, "2 3 3"]]:
     """Return where the left and the right eye are [m] and how they are turned (x forward, y left, z up)."""
     turned = rotation(pose)

@@ -83,6 +83,11 @@ def execute(run: Run, stages: Sequence[Stage], target: str) -> Path:
 
     Raises InputError when another process is at work in the same run folder.
     """
+    stages = [
+        dataclasses.replace(stage, inputs=tuple(name for name in stage.inputs if name in run.settings))
+        for stage in stages
+        if stage.name in run.settings
+    ]
     by_name = {stage.name: stage for stage in stages}
     needed = _with_inputs(by_name, target)
     prints: dict[str, str] = {}

@@ -1,7 +1,8 @@
 """How much of everything: the settings of each stage at the three scales.
 
 `smoke` goes through every stage in minutes and proves nothing about the robot; `quick` is the smallest that
-shows the result; `paper` uses the paper's figures (15 minutes of data, 1000 epochs, 235.3 m). A setting
+shows the result; `paper` uses the paper's figures (15 minutes of the teacher, 1000 epochs of its halves, 235.3 m) and
+more walks, and adds the studies of `lgmdjax.studies`: a stage that a scale has no settings for is left out. A setting
 stands here when the scale or an experiment changes it; physical numbers belong to the components' `Params`.
 """
 
@@ -54,16 +55,68 @@ class Train:
     round_epochs: int
     robots: int
     round_seconds: float  # of each robot
+    halves_epochs: int = 80  # of the fit to the teacher's walks in halves, the paper's
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A trial (`lgmdjax.trials`) that some drivers walk: how often, and for how long if not as long as it has time."""
+
+    trial: str
+    eyes: Eyes
+    seeds: int
+    seconds: float | None = None
+    drivers: tuple[str, ...] = ("teacher", "learned", "blind", "direct", "random")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Every driver on the same seeds: as many robots in the testing room, and in unseen rooms of their own."""
+    """The drivers in the paper's experiments, and in rooms that nobody has seen."""
+
+    places: tuple[Place, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bench:
+    """The rooms in which a study compares robots: as many, for as long."""
 
     eyes: Eyes
     robots: int
-    seconds: float  # of each robot, in the unseen rooms
-    testing_seconds: float  # of each robot, in the testing room
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Velocity:
+    """The eyes of a robot that walks straight on, at multiples of the nominal velocity."""
+
+    bench: Bench
+    velocities: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Teaching:
+    """Pupils of several rules and kinds: a lesson of the teacher's walks, then practice, from `seeds` starts each."""
+
+    bench: Bench
+    practice: Train
+    lesson_seconds: float  # of each robot
+    seeds: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Printed:
+    """Robots with an erratum each."""
+
+    bench: Bench
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensitivity:
+    """The robot with one thing changed at a time, and pupils of less data, from `seeds` starts each."""
+
+    bench: Bench
+    epochs: int
+    seeds: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,28 +128,65 @@ class Report:
 
 _SMALL = Eyes(width=64, height=48, pooling=2)
 _QUICK = Eyes(width=80, height=60, pooling=3)
+_SMALLER = Eyes(width=160, height=120, pooling=6)
 _PAPER = Eyes(width=320, height=240, pooling=12)
+_BENCH = Bench(eyes=_QUICK, robots=16, seconds=120)
+_SOME = ("teacher", "learned", "blind")
 
 SCALES: Mapping[Scale, Mapping[str, Any]] = {
     "smoke": {
         "fit-gait": FitGait(steps=300, seconds=6),
         "collect": Collect(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=5),
-        "train": Train(eyes=_SMALL, epochs=5, rounds=1, round_epochs=5, robots=4, round_seconds=10),
-        "evaluate": Evaluate(eyes=_SMALL, robots=4, seconds=5, testing_seconds=5),
+        "train": Train(eyes=_SMALL, epochs=5, rounds=1, round_epochs=5, robots=4, round_seconds=10, halves_epochs=5),
+        "evaluate": Evaluate(
+            places=(
+                Place(trial="testing", eyes=_SMALL, seeds=4, seconds=5),
+                Place(trial="unseen", eyes=_SMALL, seeds=4, seconds=5),
+            )
+        ),
         "report": Report(video_seconds=1),
     },
     "quick": {
         "fit-gait": FitGait(steps=3000, seconds=20),
         "collect": Collect(eyes=_QUICK, robots=16, episodes=2, seconds=45, calibration_seconds=20),
-        "train": Train(eyes=_QUICK, epochs=80, rounds=3, round_epochs=60, robots=16, round_seconds=60),
-        "evaluate": Evaluate(eyes=_QUICK, robots=16, seconds=70, testing_seconds=20),
+        "train": Train(
+            eyes=_QUICK, epochs=80, rounds=3, round_epochs=60, robots=16, round_seconds=60, halves_epochs=80
+        ),
+        "evaluate": Evaluate(
+            places=(
+                Place(trial="testing", eyes=_QUICK, seeds=16, seconds=20),
+                Place(trial="unseen", eyes=_QUICK, seeds=16, seconds=70),
+            )
+        ),
         "report": Report(video_seconds=10),
     },
     "paper": {
         "fit-gait": FitGait(steps=6000, seconds=20),
         "collect": Collect(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
-        "train": Train(eyes=_PAPER, epochs=1000, rounds=2, round_epochs=200, robots=16, round_seconds=60),
-        "evaluate": Evaluate(eyes=_PAPER, robots=16, seconds=180, testing_seconds=270),
+        "train": Train(
+            eyes=_SMALLER, epochs=200, rounds=8, round_epochs=60, robots=16, round_seconds=120, halves_epochs=1000
+        ),
+        "evaluate": Evaluate(
+            places=(
+                Place(trial="testing", eyes=_PAPER, seeds=5),
+                Place(trial="unseen", eyes=_SMALLER, seeds=64),
+                Place(trial="tube", eyes=_PAPER, seeds=8, drivers=_SOME),
+                Place(trial="indoor", eyes=_PAPER, seeds=12, drivers=_SOME),
+                Place(trial="outdoor", eyes=_PAPER, seeds=10, drivers=_SOME),
+                Place(trial="dynamic", eyes=_PAPER, seeds=10, drivers=_SOME),
+                Place(trial="white", eyes=_PAPER, seeds=12, drivers=_SOME),
+                Place(trial="corner", eyes=_PAPER, seeds=12, drivers=_SOME),
+            )
+        ),
+        "velocity": Velocity(bench=Bench(eyes=_SMALLER, robots=16, seconds=20)),
+        "teaching": Teaching(
+            bench=_BENCH,
+            practice=Train(eyes=_QUICK, epochs=100, rounds=2, round_epochs=60, robots=16, round_seconds=60),
+            lesson_seconds=30,
+            seeds=3,
+        ),
+        "printed": Printed(bench=Bench(eyes=_QUICK, robots=16, seconds=60)),
+        "sensitivity": Sensitivity(bench=_BENCH, epochs=100, seeds=3),
         "report": Report(video_seconds=30),
     },
 }

@@ -37,6 +37,8 @@ class Params:
     teacher: braitenberg.Params
     camera: camera.Params
     laser: laser.Params
+    every: Int[Array, ""] | None = None  # frames from one picture to the next, 1 if None; u stands in between
+    sway: Float[Array, ""] | None = None  # of the head, as a multiple of the trunk's, 1 if None
 
 
 @struct.dataclass(kw_only=True)
@@ -55,6 +57,7 @@ class State:
     data: mjx.Data
     controller: controller.State
     teacher: braitenberg.State
+    response: lgmd.Response  # to the last picture, of two eyes
     frame: Int[Array, ""]  # frames since the start
     setbacks: Int[Array, ""]  # times that it was put down again
     fresh: Bool[Array, ""]  # just put down: the eyes have no last picture yet
@@ -127,6 +130,7 @@ def init(params: Params, model: mjx.Model, room: Room, driver: Driver) -> State:
         data=hexapod.reset(model, room.starts[0]),
         controller=controller.init(params.controller, dark, driver, room.key),
         teacher=braitenberg.init(params.teacher),
+        response=lgmd.Response(u=jnp.full(2, lgmd.STILL), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2)),
         frame=jnp.asarray(0, jnp.int32),
         setbacks=jnp.asarray(0, jnp.int32),
         fresh=jnp.asarray(True),
@@ -176,13 +180,17 @@ def sense(
     distances = laser.hemifields(laser.scan(params.laser, scene, *hexapod.laser_pose(pose)))
     nerves = state.controller
 
-    frames = look(params.camera, scene, pose, draw)
+    head = pose if params.sway is None else hexapod.swaying(pose, params.sway)
+    frames = look(params.camera, scene, head, draw)
     opened = _where(state.fresh, controller.open_eyes(params.controller, frames), nerves.lgmd)
     nerves, response = controller.see(params.controller, replace(nerves, lgmd=opened), frames)
+    if params.every is not None:
+        looks = state.fresh | (state.frame % params.every == 0)
+        nerves, response = _where(looks, (nerves, response), (state.controller, state.response))
     senses = Senses(
         u=response.u, feed_forward=response.feed_forward, excitation=response.excitation, distances=distances
     )
-    return replace(state, controller=nerves), senses
+    return replace(state, controller=nerves, response=response), senses
 
 
 def look(

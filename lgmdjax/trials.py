@@ -33,6 +33,7 @@ from lgmdjax.simulation import Record, Room
 
 LATERALS = tuple(round(0.03 * k, 2) for k in range(15))  # d_y of fig. 14 [m]
 TUBE = 1.25  # d_x of fig. 14 [m]
+ROOMS = 2**22  # far from the numbers of a run's episodes: these rooms are met nowhere else
 LIBERTY = (0.01, 0.01, np.deg2rad(2.0))  # by how much a start may be off: x, y [m], yaw [rad]
 TURNED_BACK = 0.5 * np.pi  # rad from the first heading
 
@@ -47,6 +48,7 @@ class Trial:
     seeds: int  # as many as the paper has trials, or more
     seconds: float  # of walking, at most
     beyond: float = np.inf  # m, x of the place where the way is free again
+    across: tuple[float, ...] = ()  # m, distances beside the robot's way, each once to either side, seed after seed
     ends: bool = True  # with the first touch; otherwise the robot is set back and walks on
 
 
@@ -136,7 +138,15 @@ TRIALS = {
             ends=False,
         ),
         Trial(name="unseen", figure="-", rooms=rollout.random_rooms, seeds=64, seconds=180.0, ends=False),
-        Trial(name="tube", figure="14", rooms=_tubes, seeds=8, seconds=40.0, beyond=TUBE + 0.4),
+        Trial(
+            name="tube",
+            figure="14",
+            rooms=_tubes,
+            seeds=8,
+            seconds=32.0,
+            beyond=TUBE + 0.4,
+            across=LATERALS,
+        ),
         Trial(name="indoor", figure="15a, 16a", rooms=_alike(scenes.indoor_scene), seeds=12, seconds=60.0, beyond=2.2),
         Trial(name="outdoor", figure="15b", rooms=_alike(scenes.outdoor_scene), seeds=10, seconds=60.0, beyond=4.0),
         Trial(name="dynamic", figure="15c, 16b, 16c", rooms=_alike(scenes.dynamic_scene), seeds=10, seconds=60.0),
@@ -144,3 +154,8 @@ TRIALS = {
         Trial(name="corner", figure="sec. 5.4", rooms=_alike(_corner), seeds=12, seconds=50.0),
     )
 }
+
+
+def draw_rooms(name: str, seeds: int, seed: int) -> Room:
+    """Set up the rooms of a trial, a robot each: `seeds` times what the trial has."""
+    return TRIALS[name].rooms(jax.random.fold_in(jax.random.key(seed), ROOMS), seeds)

@@ -9,14 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from lgmdjax import braitenberg, calibration, drivers, episodes, hexapod, lgmd, rollout, scales
 from lgmdjax.files import read_json, write_json
 from lgmdjax.stages import crew
 
-CHOSEN = ("threshold", "suppression", "inhibition", "pooling")  # T_s, T_f, W_I, pixels a cell
+CHOSEN = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
 CALIBRATION = 2**20  # an episode number beyond any other: its rooms are met nowhere else
 
 
@@ -31,15 +30,10 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Collect, see
     writer = episodes.Writer(folder / "episodes", _parameters(settings, detector))
     for episode in range(writer.chunks, settings.episodes):
         label = f"collect: episode {episode + 1} of {settings.episodes}"
-        rooms = rooms_of(seed, episode, settings.robots)
+        rooms = crew.rooms_of(seed, episode, settings.robots)
         record = rollout.together(list(crew.walks(params, model, rooms, settings.seconds, label)))
         numbers = episode * settings.robots + np.arange(settings.robots)
         writer.write(record, episode=episode, rooms=numbers.tolist(), seed=seed)
-
-
-def rooms_of(seed: int, episode: int, robots: int):
-    """Draw the rooms of an episode, the same for the same seed and number."""
-    return rollout.random_rooms(jax.random.fold_in(jax.random.key(seed), episode), robots)
 
 
 def load_detector(folder: Path) -> lgmd.Params:
@@ -52,7 +46,7 @@ def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any
     """Walk the teacher with its eyes shut, draw what it would have seen, and choose the thresholds."""
     detector = lgmd.Params(pooling=settings.eyes.pooling)
     shut = crew.robot(gait, settings.eyes, detector, crew.everyone())
-    rooms = rooms_of(seed, CALIBRATION, settings.robots)
+    rooms = crew.rooms_of(seed, CALIBRATION, settings.robots)
     walks = crew.walks(
         crew.seat(shut, drivers.TEACHER), hexapod.build(), rooms, settings.calibration_seconds, "calibrate", draw=False
     )
@@ -65,7 +59,7 @@ def _calibrate(gait: Path, settings: scales.Collect, seed: int) -> dict[str, Any
 
 
 def _parameters(settings: scales.Collect, detector: lgmd.Params) -> dict[str, Any]:
-    """Tell what an episode was made with; room i of episode k is the i-th of `rooms_of(seed, k, robots)`."""
+    """Tell what an episode was made with; room i of episode k is the i-th of `crew.rooms_of(seed, k, robots)`."""
     made = {name: getattr(settings, name) for name in ("robots", "seconds")}
     constants = {name: getattr(detector, name) for name in CHOSEN}
     teacher = dataclasses.asdict(braitenberg.Params())

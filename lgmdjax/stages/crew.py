@@ -1,8 +1,10 @@
 """What the stages share: one robot put together from the files of a run, and walks of a crowd with a progress bar."""
 
-from collections.abc import Iterator
-from dataclasses import replace
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +16,13 @@ from lgmdjax import (
     braitenberg,
     camera,
     drivers,
+    episodes,
+    hexapod,
     lgmd,
     navigator,
     rollout,
     scales,
+    scenes,
     shaping,
     simulation,
 )
@@ -34,19 +39,28 @@ def eyes(settings: scales.Eyes) -> camera.Params:
 def robot(gait: Path, settings: scales.Eyes, detector: lgmd.Params, crew: drivers.Anyone) -> simulation.Params:
     """Put a robot together: the gait that was fitted, the eyes of the run, and anyone at the wheel."""
     networks = shaping.load(gait / "shaping.safetensors")
-    return simulation.assemble(crew, detector=detector, networks=networks, eyes=eyes(settings))
+    params = simulation.assemble(crew, detector=detector, networks=networks, eyes=eyes(settings))
+    return with_eyes(params, settings)
 
 
-def trained(run: Path | None) -> simulation.Params:
-    """Put the robot of a run together, all five drivers aboard, with the eyes that its navigator learned from.
+def trained(gait: Path = DATA, train: Path = DATA) -> simulation.Params:
+    """Put a robot together from two folders, all five drivers aboard, with the eyes that its navigator learned from.
 
-    Raises InputError if the run has not been trained; None stands for the robot that comes with the package.
+    Args:
+        gait: the folder of stage fit-gait. train: that of stage train. Left out, it is the robot that comes along.
+
+    Raises InputError if a folder has not what the stage writes.
     """
-    gait, train = (run / "fit-gait", run / "train") if run else (DATA, DATA)
     learned, header = navigator.load(train / "controller.safetensors")
     baselines = read_arrays(train / "baselines.npz")
     crew = everyone(learned, float(baselines["gain"]), baselines["replayed"])
     return robot(gait, scales.Eyes(**header["eyes"]), lgmd.Params(**header["lgmd"]), crew)
+
+
+def with_eyes(params: simulation.Params, settings: scales.Eyes) -> simulation.Params:
+    """Give a robot other eyes; whose cells look at as much of the world say nearly the same."""
+    detector = replace(params.controller.lgmd, pooling=settings.pooling)
+    return replace(params, camera=eyes(settings), controller=replace(params.controller, lgmd=detector))
 
 
 def everyone(
@@ -74,6 +88,18 @@ def everyone(
 
 
 REPLAY = 4096  # commands of the random driver; a static number, so that one compiled program serves all stages
+
+
+def taught(params: simulation.Params, learned: navigator.Params) -> simulation.Params:
+    """Give a robot another navigator."""
+    crew = params.controller.driver
+    others = (learned if isinstance(one, navigator.Params) else one for one in crew.drivers)
+    return replace(params, controller=replace(params.controller, driver=replace(crew, drivers=tuple(others))))
+
+
+def rooms_of(seed: int, episode: int, robots: int) -> simulation.Room:
+    """Draw the rooms of an episode, the same for the same seed and number."""
+    return rollout.random_rooms(jax.random.fold_in(jax.random.key(seed), episode), robots)
 
 
 def seat(params: simulation.Params, driver: drivers.Driver) -> simulation.Params:
@@ -126,6 +152,66 @@ def crowds(
         yield present, jax.tree.map(lambda leaf, present=present: leaf[: len(present)], record)
 
 
+def walked(
+    folder: Path,
+    params: simulation.Params,
+    rooms: simulation.Room,
+    seconds: float,
+    driver: drivers.Driver,
+    *,
+    seed: int,
+    facts: Mapping[str, Any],
+    label: str,
+    draw: bool | None = None,
+) -> simulation.Record:
+    """Walk a driver through rooms and keep the walks in a folder, a file a crowd; after those that are there already.
+
+    Args:
+        facts: JSON values that tell this walk from others; a folder of other walks is refused.
+        seed: that the rooms were drawn with. label: for the progress bar.
+        draw: what the eyes see; for drivers that look if None.
+    """
+    writer = episodes.Writer(folder, facts)
+    looks = driver in (drivers.LEARNED, drivers.DIRECT) if draw is None else draw
+    walks = crowds(
+        seat(params, driver), hexapod.build(), rooms, seconds, f"{label}: {driver.name}", draw=looks, done=writer.chunks
+    )
+    for numbers, record in walks:
+        writer.write(record, episode=writer.chunks, rooms=numbers, seed=seed)
+    return episodes.batched(episodes.read(folder))
+
+
+def benched(
+    folder: Path,
+    params: simulation.Params,
+    bench: scales.Bench,
+    driver: drivers.Driver,
+    seed: int,
+    *,
+    label: str,
+    draw: bool | None = None,
+    contrast: float = 1.0,
+) -> simulation.Record:
+    """Walk a driver through the rooms in which robots of a study are compared, the same for the same seed.
+
+    Args:
+        folder: as in `walked`, and so are `label` and `draw`. bench: how many rooms, and how long.
+        contrast: of all textures, by which theirs is multiplied.
+    """
+    rooms = rooms_of(seed, BENCH, bench.robots)
+    rooms = replace(rooms, arena=jax.vmap(scenes.faded, in_axes=(0, None))(rooms.arena, contrast))
+    facts = {"bench": asdict(bench), "driver": driver.name, "contrast": contrast, "robot": digest(params)}
+    return walked(folder, params, rooms, bench.seconds, driver, seed=seed, facts=facts, label=label, draw=draw)
+
+
+def digest(params: simulation.Params) -> str:
+    """Tell a robot from any other."""
+    leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)]
+    structure = repr((params.camera, jax.tree.structure(params))).encode()
+    return hashlib.sha256(b"".join(leaves) + structure).hexdigest()[:16]
+
+
+BENCH = 2**23  # number of an episode far from any other: its rooms are met nowhere else
 CROWD = 16
 CHUNK = 5.0  # s of robot time between two signs of life
 BAR = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"

@@ -1,0 +1,84 @@
+"""Practice: let the navigator walk, label its walks with the rule, and fit it to all walks so far; some rounds of it.
+
+Imitation of recorded walks alone leaves a robot that does not turn: while the teacher turns, the turn itself floods
+both eyes, so that "much moves" foretells "turn" in the recorded walks, and a robot that has not begun to turn never
+sees it. The rule is free in simulation, so the navigator's own walks are labelled with it and learned from as well.
+
+Source: Ross, Gordon & Bagnell 2011 (DAgger).
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import jax
+
+from lgmdjax import drivers, episodes, navigator, scales, simulation, tapes, training
+from lgmdjax.episodes import Walk
+from lgmdjax.stages import crew
+
+OWN_WALKS = 2**19  # number of the first episode that the navigator walks itself: rooms of their own
+KEPT_BACK = 0.25  # share of the rooms that no learner is shown; half of them choose its best epoch, half judge it
+
+
+def practise(
+    folder: Path,
+    robot: simulation.Params,
+    walks: list[Walk],
+    settings: scales.Train,
+    seed: int,
+    variant: navigator.Variant = "lstm",
+) -> list[Walk]:
+    """Fit and walk in turns; give the walks that were there and those that came.
+
+    Args:
+        folder: for fits and walks, from which an interrupted practice carries on.
+        robot: who practises; its teacher labels.
+        walks: recorded before. variant: of the navigator.
+        settings: how many rounds, how long. seed: of rooms, weights and the split.
+    """
+    for number in range(settings.rounds):
+        walks = walks + _round(folder, robot, walks, settings, seed, number, variant)
+    return walks
+
+
+def practised(folder: Path) -> list[Walk]:
+    """Read the walks of all rounds of a finished practice."""
+    rounds = sorted((folder / "walks").glob("round-*"), key=lambda place: int(place.name.partition("-")[2]))
+    return [walk for number, place in enumerate(rounds) for walk in _numbered(place, number)]
+
+
+def split(walks: Sequence[Walk], seed: int) -> tuple[list[Walk], list[Walk], list[Walk]]:
+    """Part stretches by their rooms: those to learn from, those to choose the best epoch by, those to judge by."""
+    train, kept = tapes.split_by_room(walks, KEPT_BACK, seed)
+    return train, *tapes.split_by_room(kept, 0.5, seed)
+
+
+def _round(
+    folder: Path, robot: simulation.Params, walks: list[Walk], settings: scales.Train, seed: int, number: int,
+    variant: navigator.Variant,
+) -> list[Walk]:  # fmt: skip
+    """Fit the navigator to all walks so far, let it drive one episode, and return all that it walked, labelled."""
+    place = folder / "walks" / f"round-{number}"
+    facts = {"settings": asdict(settings), "round": number, "variant": variant}
+    if not episodes.Writer(place, facts).chunks:
+        train, test = tapes.split_by_room(episodes.stretches(walks), KEPT_BACK, seed)
+        fit = training.fit(
+            navigator.create(jax.random.key(seed), variant),
+            train,
+            test,
+            training.Settings(epochs=settings.round_epochs),
+            checkpoints=folder / "checkpoints" / f"round-{number}",
+        )
+        robot = crew.taught(robot, training.enliven(fit.best, test))
+    episode = OWN_WALKS + number
+    rooms, label = crew.rooms_of(seed, episode, settings.robots), f"practice {number + 1} of {settings.rounds}"
+    how = {"seed": seed, "facts": facts, "label": label}
+    crew.walked(place, robot, rooms, settings.round_seconds, drivers.LEARNED, **how)
+    return _numbered(place, number)
+
+
+def _numbered(place: Path, number: int) -> list[Walk]:
+    """Read the walks of a round, and number their rooms apart from those of any other."""
+    walks, episode = episodes.read(place), OWN_WALKS + number
+    return [replace(walk, episode=episode, room=episode * len(walks) + walk.room) for walk in walks]

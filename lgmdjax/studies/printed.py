@@ -1,0 +1,124 @@
+"""What do the equations do that cannot work as printed? Each erratum by itself, in a robot otherwise corrected.
+
+Whether it still walks is measured on an empty floor in C MuJoCo; what u then tells of distance, and how often it
+touches something, in the rooms of the bench: once with the teacher driving, so that all walk by the same rule, and once
+with the navigator, which learned with the corrected robot and is not taught again.
+
+Writes printed.json, a row a case.
+
+Source: Cizek & Faigl, eqs. 1-5, 15, 16 and 22; the corrections are in `cpg`, `shaping`, `lgmd` and `braitenberg`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from lgmdjax import (
+    calibration,
+    cpg,
+    drivers,
+    figures,
+    files,
+    hexapod,
+    legs,
+    lesson,
+    scales,
+    scores,
+    shaping,
+    simulation,
+    treadmill,
+)
+from lgmdjax.stages import crew
+from lgmdjax.studies import teaching
+
+SECONDS = 20.0  # on the empty floor
+WALKED = 5.0  # m; of a robot that walks less there is no rate to tell
+STEPS = 3000  # of fitting networks to the paper's input
+Change = Callable[[simulation.Params, int], simulation.Params]
+
+
+def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Printed, seed: int) -> None:
+    """Put every erratum into the robot, and measure."""
+    robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+    rows = [_measure(folder, name, change(robot, seed), settings, seed) for name, change in CASES.items()]
+    files.write_json(folder / "printed.json", rows)
+
+
+def _measure(folder: Path, name: str, robot: simulation.Params, settings: scales.Printed, seed: int) -> dict[str, Any]:
+    """Walk a robot on an empty floor and in the rooms, driven by the teacher and by the navigator."""
+    nerves, steps = robot.controller, round(SECONDS / treadmill.STEP)
+    course = treadmill.targets(nerves.cpg, nerves.shaping, jnp.ones(2), steps=steps)
+    gauge = treadmill.gauge(treadmill.walk_c(hexapod.load(), course), float(nerves.cpg.cycle_time))
+    place = folder / "".join(c if c.isalnum() else "-" for c in name)
+    walks = {
+        driver.name: crew.benched(place / driver.name, robot, settings.bench, driver, seed, label=name, draw=True)
+        for driver in (drivers.TEACHER, drivers.LEARNED)
+    }
+    scored = {driver: asdict(scores.score(record, cpg.CYCLE_TIME)) for driver, record in walks.items()}
+    return {"case": name, "speed": gauge.speed, "u": calibration.follow(walks["teacher"]), **scored}
+
+
+def _rhythm(**changes: Any) -> Change:
+    def change(robot: simulation.Params, _: int) -> simulation.Params:
+        changed = {name: value if isinstance(value, bool) else jnp.asarray(value) for name, value in changes.items()}
+        return replace(robot, controller=replace(robot.controller, cpg=replace(robot.controller.cpg, **changed)))
+
+    return change
+
+
+def _detector(**changes: bool) -> Change:
+    def change(robot: simulation.Params, _: int) -> simulation.Params:
+        return replace(robot, controller=replace(robot.controller, lgmd=replace(robot.controller.lgmd, **changes)))
+
+    return change
+
+
+def _literal(robot: simulation.Params, seed: int) -> simulation.Params:
+    """Give the robot networks that hear what the paper's do."""
+    geometry = legs.geometry(hexapod.load())
+    networks: shaping.Params = lesson.teach(geometry, key=jax.random.key(seed), steps=STEPS, literal=True)
+    return replace(robot, controller=replace(robot.controller, shaping=networks))
+
+
+CASES: Mapping[str, Change] = {
+    "all corrected": lambda robot, _: robot,
+    "eqs. 1, 3: sign of w_fe": _rhythm(printed_sign=True),
+    "eqs. 1, 3: coupling W": _rhythm(coupling=cpg.coupling(within_tripod=0.40, across=0.04)),
+    "sec. 3.2: one input a leg": _literal,
+    "eq. 15: signed sum": _detector(printed_feed_forward=True),
+    "eq. 16: gate": _detector(printed_gate=True),
+    "eq. 22: rule alone": lambda robot, _: teaching.under(robot, "eq. 22"),
+}
+
+
+@figures.styled
+def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw speed, what u tells of distance, and collisions of every case, side by side; rows as in printed.json."""
+    figure = Figure(figsize=(figures.WIDTH, 0.8 + 0.3 * len(rows)), layout="constrained")
+    speed, sight, touches = figure.subplots(1, 3, sharey=True)
+    places = np.arange(len(rows))
+    speed.barh(places, [row["speed"] for row in rows], height=0.5, color=figures.QUIET)
+    speed.set(xlabel="speed at v = 1 [m/s]")
+    sight.barh(places, [row["u"]["score"] for row in rows], height=0.5, color=figures.QUIET)
+    sight.set(xlabel="u follows nearness, r")
+    for shift, driver in ((-0.15, "learned"), (0.15, "teacher")):
+        rates = np.array([[row[driver]["per_100_m"][key] for key in ("value", "low", "high")] for row in rows])
+        known = np.array([row[driver]["distance"] > WALKED for row in rows])
+        style = {"color": figures.DRIVERS[driver]}
+        touches.hlines(places[known] + shift, rates[known, 1], rates[known, 2], linewidth=1.6, alpha=0.5, **style)
+        touches.plot(rates[known, 0], places[known] + shift, "o", markersize=4.5, clip_on=False, label=driver, **style)
+    touches.set(xlabel="collisions per 100 m")
+    touches.set_xlim(left=0)
+    touches.legend(loc="upper right")
+    speed.set_yticks(places, [row["case"] for row in rows])
+    speed.set_ylim(len(rows) - 0.4, -0.6)
+    for panel in (speed, sight, touches):
+        panel.grid(False, axis="y")
+        panel.tick_params(axis="y", length=0)
+    return figure

@@ -1,0 +1,176 @@
+"""How far may eyes, room, legs and data be from those that were chosen? One thing is changed at a time.
+
+The navigator is not taught again: this is what becomes of it when it is moved to another camera or robot. Only for the
+amount of data pupils learn anew, from parts of the walks that the run recorded.
+
+| axis       | changed                                                                             |
+| ---------- | ----------------------------------------------------------------------------------- |
+| T_s, T_f   | thresholds of the detector, as multiples of the chosen ones                         |
+| overlap    | share of its picture that each eye looks at                                         |
+| pixels     | of a picture's width, with cells of the same size in degrees                         |
+| cell       | pixels of a picture of the bench's size that a cell looks at, a side                |
+| rate       | pictures a second                                                                   |
+| contrast   | of all textures, as a multiple                                                      |
+| sway       | of the head, as a multiple of the trunk's                                           |
+| minutes    | of walking that a pupil learns from, in all rooms                                   |
+| rooms      | that a pupil learns from, for the same time                                         |
+
+Writes sensitivity.json, a row a value: axis, value, whether it is the chosen one, and the score.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from lgmdjax import apprentice, cpg, drivers, episodes, figures, files, navigator, scales, scores, simulation, training
+from lgmdjax.episodes import Walk
+from lgmdjax.errors import InputError
+from lgmdjax.simulation import FRAME_RATE
+from lgmdjax.stages import crew
+
+THRESHOLDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+SUPPRESSIONS = (0.1, 0.2, 0.4, 0.7, 1.0, 2.0)
+OVERLAPS = (0.5, 0.6, 0.7, 0.8, 1.0)
+SIZES = ((54, 40, 2), (80, 60, 3), (160, 120, 6), (320, 240, 12))  # width, height, pixels a cell
+CELLS = (1, 2, 3, 4, 6)
+EVERY = (1, 2, 3, 4)  # frames from one picture to the next
+CONTRASTS = (0.25, 0.5, 0.75, 1.0, 1.25)
+SWAYS = (0.0, 1.0, 2.0, 4.0)
+SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the minutes recorded
+ROOMS = (2, 4, 8, 16, 32, 64)
+AXES = {
+    "T_s": "T_s, as a multiple of the chosen",
+    "T_f": "T_f, as a multiple of the chosen",
+    "overlap": "share of the picture that each eye looks at",
+    "pixels": "width of a picture [px], cells the same",
+    "cell": "side of a cell [px of a bench picture]",
+    "rate": "pictures a second",
+    "contrast": "contrast of all textures, as a multiple",
+    "sway": "sway of the head, as a multiple",
+    "minutes": "minutes learned from",
+    "rooms": "rooms learned from, in the same time",
+}
+
+
+def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity, seed: int) -> None:
+    """Score the robot with every change, and every pupil."""
+    robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+    rows, chosen = [], settled(settings.bench.eyes)
+    for axis, value, changed, contrast in changes(robot, settings.bench.eyes):
+        rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
+    for axis, value, walks in lessons(_recorded(inputs), seed):
+        for start in range(settings.seeds):
+            place = folder / "pupils" / f"{axis}-{value:g}-{start}"
+            pupil = crew.taught(robot, _fit(place, walks, settings.epochs, seed + start))
+            rows.append(_score(folder, pupil, settings.bench, seed, axis, value, start=start))
+    rows = [row | {"chosen": row["value"] == chosen.get(row["axis"])} for row in rows]
+    files.write_json(folder / "sensitivity.json", rows)
+
+
+def settled(eyes: scales.Eyes) -> dict[str, float]:
+    """Name the value of each axis that the robot of a bench has by itself."""
+    own = {"overlap": eyes.overlap, "pixels": eyes.width, "cell": eyes.pooling, "rate": FRAME_RATE}
+    return own | dict.fromkeys(("T_s", "T_f", "contrast", "sway"), 1.0)
+
+
+def changes(robot: simulation.Params, eyes: scales.Eyes) -> Iterator[tuple[str, float, simulation.Params, float]]:
+    """Yield (axis, value, robot, contrast of the rooms) for everything that is changed without teaching."""
+    detector = robot.controller.lgmd
+
+    def seeing(**constants: Any) -> simulation.Params:
+        return replace(robot, controller=replace(robot.controller, lgmd=replace(detector, **constants)))
+
+    for factor in THRESHOLDS:
+        yield "T_s", factor, seeing(threshold=factor * detector.threshold), 1.0
+    for factor in SUPPRESSIONS:
+        yield "T_f", factor, seeing(suppression=factor * detector.suppression), 1.0
+    for overlap in OVERLAPS:
+        yield "overlap", overlap, crew.with_eyes(robot, replace(eyes, overlap=overlap)), 1.0
+    for width, height, pooling in SIZES:
+        other = replace(eyes, width=width, height=height, pooling=pooling)
+        yield "pixels", width, crew.with_eyes(robot, other), 1.0
+    for pooling in CELLS:
+        yield "cell", pooling, crew.with_eyes(robot, replace(eyes, pooling=pooling)), 1.0
+    for frames in EVERY:
+        yield "rate", FRAME_RATE / frames, replace(robot, every=jnp.asarray(frames, jnp.int32)), 1.0
+    for contrast in CONTRASTS:
+        yield "contrast", contrast, robot, contrast
+    for factor in SWAYS:
+        yield "sway", factor, replace(robot, sway=jnp.asarray(factor, float)), 1.0
+
+
+def lessons(walks: Sequence[Walk], seed: int) -> Iterator[tuple[str, float, list[Walk]]]:
+    """Yield (axis, value, stretches to learn from) for parts of what was recorded.
+
+    Minutes are taken from the beginning of every room's walks. Rooms are drawn at random and all get the same time in
+    all: as much as the fewest rooms have.
+    """
+    stretches = episodes.stretches(walks)
+    minutes = sum(map(len, stretches)) / FRAME_RATE / 60
+    for share in SHARES:
+        part = (stretch[: max(round(share * len(stretch)), 1)] for stretch in stretches)
+        yield "minutes", share * minutes, [stretch for stretch in part if len(stretch) >= 2]
+    rooms = np.random.default_rng(seed).permutation(sorted({stretch.room for stretch in stretches}))
+    few = {count: set(rooms[:count].tolist()) for count in ROOMS if count <= len(rooms)}
+    frames = sum(len(stretch) for stretch in stretches if stretch.room in few[ROOMS[0]])
+    for count, chosen in few.items():
+        some = [stretch for stretch in stretches if stretch.room in chosen]
+        share = min(frames / sum(map(len, some)), 1.0)
+        part = (stretch[: max(round(share * len(stretch)), 1)] for stretch in some)
+        yield "rooms", count, [stretch for stretch in part if len(stretch) >= 2]
+
+
+def _recorded(inputs: Mapping[str, Path]) -> list[Walk]:
+    """Read all that the run recorded: the teacher's walks and the navigator's own."""
+    if "collect" not in inputs:
+        raise InputError("expected a run whose walks pupils can learn from, got none; name one with --run")
+    return episodes.read(inputs["collect"] / "episodes") + apprentice.practised(inputs["train"])
+
+
+def _fit(folder: Path, walks: list[Walk], epochs: int, seed: int) -> navigator.Params:
+    """Fit a pupil; the last eighth of every stretch chooses the best epoch, since a few rooms cannot be parted."""
+    train = [walk[: max(7 * len(walk) // 8, 1)] for walk in walks]
+    test = [walk[7 * len(walk) // 8 :] for walk in walks]
+    start, settings = navigator.create(jax.random.key(seed)), training.Settings(epochs=epochs)
+    return training.enliven(training.fit(start, train, test, settings, checkpoints=folder).best, test)
+
+
+def _score(
+    folder: Path, robot: simulation.Params, bench: scales.Bench, seed: int, axis: str, value: float, *,
+    contrast: float = 1.0, **facts: Any,
+) -> dict[str, Any]:  # fmt: skip
+    name = "-".join(f"{x:g}" if isinstance(x, float) else str(x) for x in (axis, float(value), *facts.values()))
+    record = crew.benched(folder / "walks" / name, robot, bench, drivers.LEARNED, seed, label=name, contrast=contrast)
+    return {"axis": axis, "value": value, **facts} | asdict(scores.score(record, cpg.CYCLE_TIME))
+
+
+@figures.styled
+def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw collisions per 100 m against every axis, with intervals; the chosen value is ringed."""
+    axes_of = [axis for axis in AXES if any(row["axis"] == axis for row in rows)]
+    figure = Figure(figsize=(figures.WIDTH, 0.4 + 1.75 * ((len(axes_of) + 1) // 2)), layout="constrained")
+    panels = np.ravel(figure.subplots((len(axes_of) + 1) // 2, 2, sharey=True))
+    for panel, axis in zip(panels, axes_of, strict=False):
+        some = [row for row in rows if row["axis"] == axis]
+        values = np.array([row["value"] for row in some], float)
+        rates = np.array([[row["per_100_m"][key] for key in ("value", "low", "high")] for row in some])
+        positions = {value: place for place, value in enumerate(sorted(set(values)))}
+        x = np.array([positions[value] for value in values]) + 0.12 * np.array([row.get("start", 0) for row in some])
+        panel.vlines(x, rates[:, 1], rates[:, 2], color=figures.LEFT, alpha=0.45, linewidth=1.6)
+        panel.plot(x, rates[:, 0], "o", color=figures.LEFT, markersize=4, clip_on=False, zorder=3)
+        ringed = np.array([row["chosen"] for row in some])
+        panel.plot(x[ringed], rates[ringed, 0], "o", markersize=9, markerfacecolor="none", color=figures.INK)
+        panel.set_xticks(list(positions.values()), [f"{value:.3g}" for value in positions])
+        panel.set(xlabel=AXES[axis])
+        panel.grid(False, axis="x")
+    for panel in panels[len(axes_of) :]:
+        panel.remove()
+    panels[0].set_ylim(0, min(panels[0].get_ylim()[1], 60.0))
+    figure.supylabel("collisions per 100 m", fontsize=8.5)
+    return figure

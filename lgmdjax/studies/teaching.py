@@ -1,0 +1,159 @@
+"""Which rule should teach, and what should learn? Navigators from several rules and of several kinds, in closed loop.
+
+The paper says that vehicle 2a alone and vehicle 3b alone make poor controllers when learned (sec. 4.2), and that an
+LSTM does better than a feed-forward network and than the rule straight on u (sec. 3.4). Here each rule teaches an LSTM,
+from its own walks and then from the pupil's, and so does the rule that this package teaches by; by that one learn the
+other kinds of network as well. All get the same rooms, the same time and as many starts, so that a difference can be
+told from luck.
+
+Writes teaching.json: a row a case and seed, with the score of the pupil, and rows of the teachers and of the direct
+driver, which learns nothing.
+
+Source: Cizek & Faigl, sec. 3.4 and 4.2.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from lgmdjax import (
+    apprentice,
+    braitenberg,
+    cpg,
+    drivers,
+    episodes,
+    figures,
+    files,
+    navigator,
+    scales,
+    scores,
+    simulation,
+    training,
+)
+from lgmdjax.stages import crew
+
+_PRINTED = braitenberg.Params(full_turn=0.0, symmetry=0.0)  # eq. 22 within the gait's range
+RULES = {
+    "2a": replace(_PRINTED, gain_3b=0.0),
+    "3b": replace(_PRINTED, gain_2a=0.0),
+    "eq. 22": _PRINTED,
+    "teacher": braitenberg.Params(),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """Who learns from whom."""
+
+    rule: str
+    variant: navigator.Variant
+
+
+CASES = (
+    Case(rule="2a", variant="lstm"),
+    Case(rule="3b", variant="lstm"),
+    Case(rule="eq. 22", variant="lstm"),
+    Case(rule="teacher", variant="lstm"),
+    Case(rule="teacher", variant="lstm-efference"),
+    Case(rule="teacher", variant="feed-forward"),
+)
+
+
+def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Teaching, seed: int) -> None:
+    """Teach every case from every start, and score all on one bench."""
+    robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+    rows = []
+    for rule in RULES:
+        rows.append(_score(folder / f"rule-{rule}", under(robot, rule), settings, drivers.TEACHER, seed, rule=rule))
+    rows.append(_score(folder / "direct", robot, settings, drivers.DIRECT, seed, rule="teacher"))
+    for number in range(settings.seeds):
+        for case in CASES:
+            place = folder / f"{case.rule}-{case.variant}-{number}"
+            pupil = teach(place, under(robot, case.rule), case.variant, settings, seed + number)
+            facts = {"rule": case.rule, "variant": case.variant, "start": number}
+            rows.append(_score(place / "bench", pupil, settings, drivers.LEARNED, seed, **facts))
+    files.write_json(folder / "teaching.json", rows)
+
+
+def under(robot: simulation.Params, rule: str) -> simulation.Params:
+    """Put a robot under a rule, which labels its walks and drives when the teacher does."""
+    params = jax.tree.map(lambda value: jnp.asarray(value, float), RULES[rule])
+    crew_ = robot.controller.driver
+    others = (params if isinstance(one, braitenberg.Params) else one for one in crew_.drivers)
+    driver = replace(crew_, drivers=tuple(others))
+    return replace(robot, teacher=params, controller=replace(robot.controller, driver=driver))
+
+
+def teach(
+    folder: Path, robot: simulation.Params, variant: navigator.Variant, settings: scales.Teaching, seed: int
+) -> simulation.Params:
+    """Let a robot's teacher walk, its pupil practise, and fit the pupil once more; give the robot with it aboard."""
+    school = settings.practice
+    rooms = crew.rooms_of(seed, 0, school.robots)
+    facts = {"school": asdict(settings), "robot": crew.digest(robot)}
+    how = {"seed": seed, "facts": facts, "label": "lesson", "draw": True}
+    crew.walked(folder / "lesson", robot, rooms, settings.lesson_seconds, drivers.TEACHER, **how)
+    walks = apprentice.practise(folder, robot, episodes.read(folder / "lesson"), school, seed, variant)
+    train, test, _ = apprentice.split(episodes.stretches(walks), seed)
+    start, epochs = navigator.create(jax.random.key(seed), variant), training.Settings(epochs=school.epochs)
+    fit = training.fit(start, train, test, epochs, checkpoints=folder / "checkpoints" / "last")
+    return crew.taught(robot, training.enliven(fit.best, test))
+
+
+def _score(
+    folder: Path, robot: simulation.Params, settings: scales.Teaching, driver: drivers.Driver, seed: int, **facts: Any
+) -> dict[str, Any]:
+    record = crew.benched(folder, robot, settings.bench, driver, seed, label=" ".join(map(str, facts.values())))
+    return {"driver": driver.name, **facts} | asdict(scores.score(record, cpg.CYCLE_TIME))
+
+
+@figures.styled
+def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw collisions per 100 m of every case, a dot a start with its interval; rows as in teaching.json."""
+    names = list(dict.fromkeys(label(row) for row in rows))
+    figure = Figure(figsize=(figures.WIDTH, 0.9 + 0.34 * len(names)), layout="constrained")
+    axes = figure.subplots()
+    for row in rows:
+        rate, start = row["per_100_m"], row.get("start", 0)
+        y = names.index(label(row)) + 0.16 * (start - 1 if "start" in row else 0)
+        colour = figures.DRIVERS[row["driver"]]
+        axes.plot([rate["low"], rate["high"]], [y, y], color=colour, linewidth=1.6, alpha=0.6)
+        axes.plot([rate["value"]], [y], "o", color=colour, markersize=4.5, clip_on=False, zorder=3)
+    axes.set_yticks(range(len(names)), names)
+    axes.set(xlabel="collisions per 100 m", ylim=(len(names) - 0.4, -0.6))
+    axes.set_xlim(0, 1.05 * axes.get_xlim()[1])
+    axes.grid(False, axis="y")
+    axes.tick_params(axis="y", length=0)
+    return figure
+
+
+def label(row: Mapping[str, Any]) -> str:
+    """Name the case of a row."""
+    if row["driver"] == "learned":
+        return f"{row['variant']}, taught by {row['rule']}"
+    return "direct, nothing learned" if row["driver"] == "direct" else f"{row['rule']} itself, on the laser"
+
+
+def pooled(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Sum collisions and ways of the starts of each case, in the order of the rows, with the rates of each start."""
+    cases: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        cases.setdefault(label(row), []).append(row)
+    return {
+        name: {
+            "starts": len(some),
+            "distance": sum(row["distance"] for row in some),
+            "collisions": sum(row["collisions"] for row in some),
+            "per_100_m": asdict(
+                scores.poisson_rate(sum(row["collisions"] for row in some), sum(row["distance"] for row in some) / 100)
+            ),
+            "each": np.array([row["per_100_m"]["value"] for row in some]).tolist(),
+        }
+        for name, some in cases.items()
+    }
