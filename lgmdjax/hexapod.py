@@ -34,6 +34,7 @@ LEGS = ("left_front", "left_middle", "left_rear", "right_rear", "right_middle", 
 JOINTS = ("coxa", "femur", "tibia")
 PARTS = ("trunk", *LEGS)  # what has obstacle slots of its own
 EYES = ("eye_left", "eye_right")
+CAPSULES = ("bumper", *(f"{leg}_{part}" for leg in LEGS for part in JOINTS[1:]))  # what collides, in capsules' order
 LOWEST, HIGHEST = 0.04, 0.30  # m; where the trunk of a robot on its feet can be
 LEAST_UPRIGHT = 0.7  # cosine of the trunk's tilt; below it (45 degrees) the robot has fallen
 ASIDE = 100.0  # m, the height at which a slot is out of the way
@@ -129,7 +130,7 @@ def _anatomy() -> _Anatomy:
         stance=model.key("stance").qpos.copy(),
         eyes=np.stack([model.site(name).pos for name in EYES]),
         laser=model.site("laser").pos.copy(),
-        capsules=geoms(["bumper", *(f"{leg}_{part}" for leg in LEGS for part in ("femur", "tibia"))]),
+        capsules=geoms([*CAPSULES]),
         feet=geoms([f"{leg}_foot" for leg in LEGS]),
         boxes=geoms([f"slot_box_{part}" for part in PARTS]),
         cylinders=geoms([f"slot_cylinder_{part}" for part in PARTS]),
