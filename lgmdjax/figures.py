@@ -412,9 +412,7 @@ def passages(
         across: how far beside the robot's way the obstacle stood [m]; the clearance is then drawn against it.
     """
     figure = Figure(figsize=(WIDTH, 4.2 if across is None else 6.4))
-    axes, *below = np.ravel(
-        figure.subplots(1 if across is None else 2, height_ratios=(2.0, 1.0)[: 1 + (across is not None)])
-    )
+    axes = figure.subplots() if across is None else _beside(figure, touched, clearance, across)
     for arena in arenas:
         draw_room(axes, arena)
     for path, bad in zip(paths, touched, strict=True):
@@ -424,13 +422,20 @@ def passages(
     axes.set(xlim=(least[0] - 0.4, most[0] + 0.8), ylim=(least[1] - 0.8, most[1] + 0.8))
     axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{np.sum(~touched)} of {len(paths)} got through", aspect="equal")
     axes.grid(False)
-    for panel in below:
-        for bad, style in ((False, {"color": LEFT, "marker": "o"}), (True, {"color": ALARM, "marker": "X"})):
-            some = touched == bad
-            panel.plot(across[some], 100 * np.maximum(clearance[some], 0), linestyle="none", markersize=4, **style)
-        panel.set(xlabel="obstacle beside the robot's way, d_y [m]", ylabel="least clearance [cm]")
-        panel.set_ylim(bottom=0)
     return figure
+
+
+def _beside(
+    figure: Figure, touched: Bool[ndarray, " n"], clearance: Float[ndarray, " n"], across: Float[ndarray, " n"]
+) -> Axes:
+    """Draw the clearance against where the obstacle stood in the lower third; give the axes above."""
+    above, below = figure.subplots(2, height_ratios=(2.0, 1.0))
+    for bad, style in ((False, {"color": LEFT, "marker": "o"}), (True, {"color": ALARM, "marker": "X"})):
+        some = touched == bad
+        below.plot(across[some], 100 * np.maximum(clearance[some], 0), linestyle="none", markersize=4, **style)
+    below.set(xlabel="obstacle beside the robot's way, d_y [m]", ylabel="least clearance [cm]")
+    below.set_ylim(bottom=0)
+    return above
 
 
 def draw_room(axes: Axes, arena: Arena) -> None:

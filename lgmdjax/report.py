@@ -9,7 +9,9 @@ written into the page itself, so that it works offline. The page appears whole o
 | legs          | fit-gait/gait.json, fit-gait/cpg.npz, fit-gait/foot.npz                     |
 | eyes          | evaluate/layers.npz, collect/calibration.json                               |
 | learning      | train/training.json, train/prediction.npz                                   |
-| walking       | evaluate/evaluation.json, evaluate/trajectories.npz                         |
+| walking       | evaluate/evaluation.json, evaluate/kinds.json, evaluate/trajectories.npz    |
+| experiments   | evaluate/evaluation.json, evaluate/<trial>.svg                              |
+| studies       | <study>/<study>.json, where the scale has studies                           |
 | how made      | run.json, the done.json of each stage                                       |
 """
 
@@ -25,15 +27,17 @@ import jinja2
 import numpy as np
 from matplotlib.figure import Figure
 
-from lgmdjax import arena, camera, figures, film, hexapod, scenes
+from lgmdjax import arena, camera, collisions, figures, film, hexapod, scenes, trials
 from lgmdjax.errors import InputError
 from lgmdjax.files import read_arrays, read_json
 from lgmdjax.gait import Gait
+from lgmdjax.studies import printed, sensitivity, teaching, velocity
 
 MINUS = "\N{MINUS SIGN}"
 NOMINAL = float(Gait().nominal_velocity)  # m/s, the speed at v = 1
 STAGES = ("fit-gait", "collect", "train", "evaluate")  # the folders of their files, and the commands that make them
-PLACES = {"testing": "the testing room", "unseen": "random rooms never seen"}
+STUDIES = {"velocity": velocity, "teaching": teaching, "printed": printed, "sensitivity": sensitivity}
+PLACES = {name: trial.title for name, trial in trials.TRIALS.items()}
 LOOKS_AT = {
     "teacher": "laser scanner",
     "learned": "both LGMDs",
@@ -91,16 +95,24 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
     gait, evaluation = read_json(run / "fit-gait/gait.json"), read_json(run / "evaluate/evaluation.json")
     training, calibration = read_json(run / "train/training.json"), read_json(run / "collect/calibration.json")
     rhythm = read_arrays(run / "fit-gait/cpg.npz")
-    stages = [{"name": stage, **read_json(run / f"{stage}/done.json")} for stage in STAGES]
-    eyes = camera.Params(**{name: facts["settings"]["evaluate"]["eyes"][name] for name in ("width", "height")})
+    studied = {name: read_json(run / f"{name}/{name}.json") for name in STUDIES if name in facts["settings"]}
+    stages = [{"name": stage, **read_json(run / f"{stage}/done.json")} for stage in (*STAGES, *studied)]
+    walked = {place: table for place, table in evaluation.items() if "per_100_m" in next(iter(table.values()))}
+    passed = {trial: table for trial, table in evaluation.items() if trial not in walked}
+    kinds, places = read_json(run / "evaluate/kinds.json"), facts["settings"]["evaluate"]["places"]
+    shown = next(place["eyes"] for place in places if place["trial"] == "testing")
+    eyes = camera.Params(width=shown["width"], height=shown["height"])
     drawn = {
         **_gait_figures(run, gait, rhythm),
         **_eye_figures(run, calibration),
         **_learning_figures(run, training),
-        **_walking_figures(run, evaluation, room),
+        **_walking_figures(run, walked, room),
+        **{name: STUDIES[name].draw(rows) for name, rows in studied.items()},
     }
+    pictures = {name: figures.to_svg(figure) for name, figure in drawn.items()}
+    pictures |= {trial: (run / f"evaluate/{trial}.svg").read_bytes() for trial in passed}
     return {
-        "figures": {name: _inline_svg(figure) for name, figure in drawn.items()},
+        "figures": {name: _inline("image/svg+xml", picture) for name, picture in pictures.items()},
         "film": _film(run, eyes, calibration, room, video_seconds),
         "eyes": eyes,
         "layers_size": list(reversed(read_arrays(run / "evaluate/layers.npz")["picture"].shape)),
@@ -110,8 +122,14 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "rhythm": {name: float(rhythm[name]) for name in ("period", "transient_cycles")},
         "calibration": calibration,
         "training": training,
-        "evaluation": evaluation,
-        "verdicts": {place: verdict(scores) for place, scores in evaluation.items()},
+        "evaluation": walked,
+        "verdicts": {place: verdict(scores) for place, scores in walked.items()},
+        "passed": passed,
+        "kinds": {place: counts for place, counts in kinds.items() if any(counts.values())},
+        "meanings": collisions.KINDS,
+        "experiments": trials.TRIALS,
+        "studied": studied,
+        "pupils": teaching.pooled(studied.get("teaching", [])),
         "stages": stages,
         "versions": versions(stages),
         "size": _size(),
@@ -222,10 +240,6 @@ def _fixed(value: float, decimals: int) -> str:
     if value is None or not math.isfinite(value):
         return "–"
     return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", MINUS)  # + 0.0 makes -0 plain 0
-
-
-def _inline_svg(figure: Figure) -> str:
-    return _inline("image/svg+xml", figures.to_svg(figure))
 
 
 def _inline(kind: str, content: bytes) -> str:

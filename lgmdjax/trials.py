@@ -43,7 +43,10 @@ class Trial:
     """One experiment; `rooms(key, seeds)` sets up its robots."""
 
     name: str
-    figure: str  # of the paper
+    title: str
+    source: str  # figure or section of the paper
+    paper: str  # what it reports
+    shows: str
     rooms: Callable[[Array, int], Room]
     seeds: int  # as many as the paper has trials, or more
     seconds: float  # of walking, at most
@@ -131,27 +134,90 @@ TRIALS = {
     for trial in (
         Trial(
             name="testing",
-            figure="13",
+            title="the testing room",
+            source="fig. 13",
+            paper="235.3 m in five trials, no collision",
+            shows="Sixteen obstacles, from (0, 2.5).",
             rooms=lambda key, seeds: rollout.copies(key, scenes.testing_room(), seeds),
             seeds=5,
             seconds=800.0,
             ends=False,
         ),
-        Trial(name="unseen", figure="-", rooms=rollout.random_rooms, seeds=64, seconds=180.0, ends=False),
+        Trial(
+            name="unseen",
+            title="random rooms never seen",
+            source="-",
+            paper="not done",
+            shows="A random room a robot.",
+            rooms=rollout.random_rooms,
+            seeds=64,
+            seconds=180.0,
+            ends=False,
+        ),
         Trial(
             name="tube",
-            figure="14",
+            title="a single obstacle",
+            source="fig. 14",
+            paper="15 of 15",
+            shows="A tube 1.25 m ahead, up to 0.42 m to a side, before a white wall; below, how near the robot came.",
             rooms=_tubes,
             seeds=8,
             seconds=32.0,
             beyond=TUBE + 0.4,
             across=LATERALS,
         ),
-        Trial(name="indoor", figure="15a, 16a", rooms=_alike(scenes.indoor_scene), seeds=12, seconds=60.0, beyond=2.2),
-        Trial(name="outdoor", figure="15b", rooms=_alike(scenes.outdoor_scene), seeds=10, seconds=60.0, beyond=4.0),
-        Trial(name="dynamic", figure="15c, 16b, 16c", rooms=_alike(scenes.dynamic_scene), seeds=10, seconds=60.0),
-        Trial(name="white", figure="sec. 5.4", rooms=_alike(_white), seeds=12, seconds=40.0),
-        Trial(name="corner", figure="sec. 5.4", rooms=_alike(_corner), seeds=12, seconds=50.0),
+        Trial(
+            name="indoor",
+            title="indoors",
+            source="figs. 15a and 16a",
+            paper="12 of 12",
+            shows="A box 1.2 m ahead, another to the right, a table with thin legs to the left (its top dashed).",
+            rooms=_alike(scenes.indoor_scene),
+            seeds=12,
+            seconds=60.0,
+            beyond=2.2,
+        ),
+        Trial(
+            name="outdoor",
+            title="outdoors",
+            source="fig. 15b",
+            paper="10 of 10",
+            shows="Trees with crowns (dashed), bushes and hedges on grass, before a facade.",
+            rooms=_alike(scenes.outdoor_scene),
+            seeds=10,
+            seconds=60.0,
+            beyond=4.0,
+        ),
+        Trial(
+            name="dynamic",
+            title="things put in the way",
+            source="figs. 15c, 16b and 16c",
+            paper="10 of 10, twice by walking backward",
+            shows="A box is put in the way from the left, then one from the right (dotted).",
+            rooms=_alike(scenes.dynamic_scene),
+            seeds=10,
+            seconds=60.0,
+        ),
+        Trial(
+            name="white",
+            title="a white wall",
+            source="sec. 5.4",
+            paper="fails",
+            shows="Walls without contrast make no edges: a detector of edges cannot see them but for their rims.",
+            rooms=_alike(_white),
+            seeds=12,
+            seconds=40.0,
+        ),
+        Trial(
+            name="corner",
+            title="a corner",
+            source="sec. 5.4",
+            paper="fails",
+            shows="Walking into the corner of two walls, the robot has as much before the one eye as before the other.",
+            rooms=_alike(_corner),
+            seeds=12,
+            seconds=50.0,
+        ),
     )
 }
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lgmdjax import arena
+from lgmdjax.collisions import KINDS
 from lgmdjax.simulation import FRAME_RATE, Record
 
 DRIVERS = ("teacher", "learned", "blind", "direct", "random")
@@ -95,7 +96,7 @@ def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (24
         _json(folder / name / "done.json", {"seconds": 12.5, "device": "cpu, 2 cores", "versions": versions})
     settings = {
         "fit-gait": {"steps": 3000, "seconds": 25},
-        "evaluate": {"eyes": {"width": 80, "height": 60}, "seconds": 60},
+        "evaluate": {"places": [{"trial": "testing", "eyes": {"width": 80, "height": 60}}]},
         "train": {"epochs": 40, "rounds": 2},
     }
     _json(
@@ -233,6 +234,8 @@ def _write_evaluate(folder: Path, generator: np.random.Generator, frames: int, p
         folder / "evaluation.json",
         {"testing": scores, "unseen": {name: score(1.1 * r) for name, r in RATES.items()}},
     )
+    kinds = {"corner": 0, "did not see": 1, "saw both sides": 0, "tail swing": 2, "turned the other way": 0}
+    _json(folder / "kinds.json", {"testing": kinds | {"turned too late": 5}, "unseen": dict.fromkeys(KINDS, 0)})
     paths = {f"testing_{name}{key}": value for name in DRIVERS for key, value in walks(generator, 5, frames).items()}
     unseen = {f"unseen_learned{key}": value for key, value in walks(generator, 4, frames).items()}
     np.savez(folder / "trajectories.npz", allow_pickle=False, **paths, **unseen)

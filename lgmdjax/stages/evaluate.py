@@ -1,8 +1,8 @@
 """Stage evaluate: the drivers in the paper's experiments, each in the same rooms from the same starts.
 
 Writes evaluation.json (what came of every trial and driver), trajectories.npz (fig. 13), <trial>.svg (figs. 14 to 16),
-walk.npz (the film) and layers.npz (fig. 6b), and one Parquet folder of walks a trial and driver, from which an interrupted run carries on with
-the crowd that it was at.
+kinds.json (why the learned controller collided), walk.npz (the film) and layers.npz (fig. 6b), and one Parquet folder
+of walks a trial and driver, from which an interrupted run carries on with the crowd that it was at.
 """
 
 import dataclasses
@@ -12,7 +12,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from lgmdjax import attempt, camera, episodes, figures, lgmd, redraw, scales, scenes, simulation, trials
+from lgmdjax import attempt, camera, collisions, episodes, figures, lgmd, redraw, scales, scenes, simulation, trials
+from lgmdjax.errors import InputError
 from lgmdjax.files import write_json
 from lgmdjax.stages import crew
 
@@ -35,6 +36,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Evaluate, se
             rooms = trials.draw_rooms(trial.name, place.seeds, seed)
             drawing = attempt.draw(trial, rooms, walked[trial.name]["learned"])
             (folder / f"{trial.name}.svg").write_bytes(figures.to_svg(drawing))
+    write_json(folder / "kinds.json", _kinds(settings, walked, seed))
     roaming = {trial: records for trial, records in walked.items() if not trials.TRIALS[trial].ends}
     np.savez(folder / "trajectories.npz", allow_pickle=False, **_trajectories(roaming))
     shown = _one(walked["testing"]["learned"], _liveliest(walked["testing"]["learned"]))
@@ -49,6 +51,25 @@ def _walk(folder: Path, place: scales.Place, robot: simulation.Params, driver: s
     seconds = place.seconds or trials.TRIALS[place.trial].seconds
     tried = attempt.tried(eyed, place.trial, driver, place.seeds, seconds)
     return attempt.walk(folder / place.trial / driver, tried, eyed, seed)[1]
+
+
+def _kinds(
+    settings: scales.Evaluate, walked: Mapping[str, Mapping[str, simulation.Record]], seed: int
+) -> dict[str, dict[str, int]]:
+    """Count the kinds of the learned controller's collisions in each trial; nothing if it walked too little to tell."""
+    try:
+        yardstick = collisions.measure(walked["unseen"]["learned"])
+    except InputError:
+        return {}
+    counts = {}
+    for place in settings.places:
+        trial, record = trials.TRIALS[place.trial], walked[place.trial]["learned"]
+        found = collisions.find(record, trials.draw_rooms(trial.name, place.seeds, seed).arena, yardstick)
+        if trial.ends:
+            ends = trials.judge(trial, record).frames
+            found = [collision for collision in found if collision.frame < ends[collision.robot]]
+        counts[trial.name] = collisions.count(found)
+    return counts
 
 
 def _trajectories(walked: Mapping[str, Mapping[str, simulation.Record]]) -> dict[str, np.ndarray]:
