@@ -1,7 +1,9 @@
 """Train the controller that comes with the package: `python experiments/train_controller.py` (half an hour, two cores).
 
-As `lgmdjax train --scale paper`, at the paper's resolution, but with three rounds of the robot's own walks and fewer
-epochs, which is enough. Interrupted, the same command carries on.
+As `lgmdjax train --scale paper` does, but in more rooms, and without the networks that the paper's is compared with.
+The eyes have pictures of 80 x 60, whose cells look at as many degrees as those of the paper's 320 x 240 do, and say the
+same (the difference of the two u correlates with 0.996): the walk is ten times as fast. Interrupted, the same command
+carries on.
 """
 
 import shutil
@@ -14,11 +16,14 @@ from lgmdjax.cli import import_physics, prepare_jax
 from lgmdjax.runs import execute, open_run
 from lgmdjax.stages import STAGES, crew
 
-PAPER = scales.SCALES["paper"]
-EYES = PAPER["collect"].eyes
-SETTINGS = dict(PAPER) | {
+QUICK, PAPER = scales.SCALES["quick"], scales.SCALES["paper"]
+EYES = QUICK["collect"].eyes
+SETTINGS = {
+    "fit-gait": PAPER["fit-gait"],
     "collect": scales.Collect(eyes=EYES, robots=16, episodes=2, seconds=28.125, calibration_seconds=20),
-    "train": scales.Train(eyes=EYES, epochs=200, rounds=3, round_epochs=80, robots=16, round_seconds=60),
+    "train": scales.Train(
+        eyes=EYES, epochs=80, rounds=12, round_epochs=60, robots=32, round_seconds=60, variants=("lstm",)
+    ),
 }
 FILES = ("controller.safetensors", "baselines.npz")
 

@@ -56,6 +56,7 @@ class Train:
     robots: int
     round_seconds: float  # of each robot
     halves_epochs: int = 80  # of the fit to the teacher's walks in halves, the paper's
+    variants: tuple[str, ...] = ("lstm", "lstm-efference", "feed-forward", "mean")
 
 
 @dataclass(frozen=True, kw_only=True)

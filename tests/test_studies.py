@@ -1,0 +1,188 @@
+"""The studies: what they change, what they count, and their figures, on walks and rows made up."""
+
+from dataclasses import asdict, replace
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic
+from scipy.spatial.transform import Rotation
+
+from lgmdjax import braitenberg, calibration, episodes, figures, hexapod, scales, scores, simulation
+from lgmdjax.stages import STUDIES, crew
+from lgmdjax.studies import printed, sensitivity, teaching, velocity
+
+EYES = scales.Eyes(width=80, height=60, pooling=3)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return crew.with_eyes(crew.trained(), EYES)
+
+
+def leaves(params) -> dict[str, np.ndarray]:
+    found = jax.tree_util.tree_leaves_with_path(params)
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}
+
+
+def test_every_study_has_settings_at_paper_scale_alone():
+    for study in STUDIES:
+        assert study.name in scales.SCALES["paper"]
+        assert study.name not in scales.SCALES["quick"] and study.name not in scales.SCALES["smoke"]
+
+
+def test_velocity_tells_obstructed_frames_from_free_ones():
+    """u is 0.6 + noise where something is near and 0.5 + noise where nothing is, so d is 0.1 over the noise."""
+    generator = np.random.default_rng(0)
+    record = synthetic.walk(robots=4, frames=1500)
+    distance = np.where(np.arange(1500) % 500 < 250, 0.4, 3.0)
+    noise = np.repeat(generator.normal(0, 0.02, (4, 60, 1)), 25, axis=1)
+    u = np.where(distance < 1, 0.6, 0.5)[None, :, None] + noise
+    near_and_far = np.broadcast_to(distance[None, :, None], (4, 1500, 2))
+    changed = replace(record, u=np.repeat(u, 2, axis=-1), distances=near_and_far)
+    row = velocity.measure(1.5, changed, suppression=1.0)
+    assert row.obstructed == pytest.approx(0.6, abs=0.01) and row.free == pytest.approx(0.5, abs=0.01)
+    assert row.effect == pytest.approx(0.1 / row.spread, rel=0.15)
+    assert row.speed == pytest.approx(0.05, rel=0.1)  # what is left of the sway counts as way
+    assert row.silenced == 0
+
+
+def test_at_velocity_seats_a_blind_driver_of_that_velocity(robot):
+    blind = velocity.at_velocity(robot, 2.5).controller.driver.drivers[2]
+    np.testing.assert_allclose(blind.velocity, 2.5)
+
+
+def test_under_a_rule_the_robot_is_labelled_and_driven_by_it(robot):
+    ruled = teaching.under(robot, "2a")
+    assert float(ruled.teacher.gain_3b) == 0 and float(ruled.controller.driver.drivers[0].gain_3b) == 0
+    distances = jnp.asarray([0.4, 2.0])
+    _, label = braitenberg.step(ruled.teacher, braitenberg.init(ruled.teacher), distances)
+    np.testing.assert_allclose(label, np.clip(1.2 + 0.8 / np.array([0.4, 2.0]), -1, 2), atol=0.41)
+    assert label[0] > label[1]  # 2a excites its own side, and so turns away
+
+
+def test_starts_of_a_case_are_pooled():
+    rows = [
+        {"driver": "learned", "rule": "2a", "variant": "lstm", "distance": 50.0, "collisions": n}
+        | {"per_100_m": asdict(scores.poisson_rate(n, 0.5))}
+        for n in (1, 4)
+    ]
+    (pupil,) = teaching.pooled(rows).values()
+    assert (pupil["starts"], pupil["distance"], pupil["collisions"], pupil["each"]) == (2, 100.0, 5, [2.0, 8.0])
+    assert pupil["per_100_m"] == asdict(scores.poisson_rate(5, 1.0))
+
+
+def test_an_erratum_changes_one_thing(robot):
+    before = leaves(robot)
+    for name in ("eqs. 1, 3: coupling W", "eq. 22: rule alone"):
+        after = leaves(printed.CASES[name](robot, 0))
+        changed = {path for path in before if not np.array_equal(before[path], after[path])}
+        assert changed and all(
+            ("coupling" in path) or ("full_turn" in path) or ("symmetry" in path) for path in changed
+        )
+    assert printed.CASES["eq. 16: gate"](robot, 0).controller.lgmd.printed_gate
+    assert printed.CASES["eq. 15: signed sum"](robot, 0).controller.lgmd.printed_feed_forward
+    assert printed.CASES["eqs. 1, 3: sign of w_fe"](robot, 0).controller.cpg.printed_sign
+
+
+def test_every_axis_of_sensitivity_has_the_chosen_value_once(robot):
+    chosen = sensitivity.settled(EYES)
+    values: dict[str, list[float]] = {}
+    for axis, value, changed, contrast in sensitivity.changes(robot, EYES):
+        values.setdefault(axis, []).append(value)
+        if value == chosen[axis] and axis not in ("rate", "sway"):  # which say so by being left out
+            assert contrast == 1.0
+            jax.tree.map(np.testing.assert_array_equal, changed, robot)
+    assert set(values) == set(chosen)
+    for axis, some in values.items():
+        assert some.count(chosen[axis]) == 1, axis
+
+
+def test_lessons_are_of_the_minutes_and_rooms_asked_for():
+    generator = np.random.default_rng(1)
+    walks = []
+    for room in range(8):
+        record = vars(synthetic.walk(1, int(generator.integers(400, 900))))
+        fields = {name: np.asarray(leaf)[0] for name, leaf in record.items()}
+        walks.append(episodes.Walk(episode=0, robot=room, room=room, seed=0, **fields))
+    whole = sum(len(stretch) for stretch in episodes.stretches(walks)) / 1800
+    asked = list(sensitivity.lessons(walks, seed=0))
+    for _, value, some in (lesson for lesson in asked if lesson[0] == "minutes"):
+        assert sum(map(len, some)) / 1800 == pytest.approx(value, abs=0.01)
+        assert value <= whole + 1e-9
+    rooms = [(value, some) for axis, value, some in asked if axis == "rooms"]
+    assert [value for value, _ in rooms] == [2, 4, 8]
+    for value, some in rooms:
+        assert len({walk.room for walk in some}) == value
+        assert sum(map(len, some)) == pytest.approx(sum(map(len, rooms[0][1])), abs=2 * value)
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0, 3.0])
+def test_swaying_scales_the_tilt_and_keeps_the_heading(factor):
+    """The tilt is what is left of a rotation when the heading is taken off (SciPy)."""
+    for yaw, roll, pitch in ((0.3, 0.05, -0.1), (-2.5, -0.2, 0.02), (3.0, 0.0, 0.1)):
+        heading = Rotation.from_euler("z", yaw)
+        tilt = Rotation.from_rotvec([roll, pitch, 0.0])
+        before = (heading * tilt).as_quat(scalar_first=True)
+        pose = hexapod.Pose(position=jnp.zeros(3), quaternion=jnp.asarray(before))
+        after = hexapod.swaying(pose, jnp.asarray(factor)).quaternion
+        expected = heading * Rotation.from_rotvec([factor * roll, factor * pitch, 0.0])
+        turned = Rotation.from_quat(np.asarray(after), scalar_first=True)
+        assert (turned * expected.inv()).magnitude() < 1e-7
+
+
+def test_a_level_head_does_not_sway():
+    pose = hexapod.Pose(position=jnp.zeros(3), quaternion=jnp.asarray([np.cos(0.4), 0.0, 0.0, np.sin(0.4)]))
+    np.testing.assert_allclose(hexapod.swaying(pose, jnp.asarray(3.0)).quaternion, pose.quaternion, atol=1e-12)
+
+
+def test_follow_agrees_with_correlation_of_what_was_recorded():
+    generator = np.random.default_rng(2)
+    distances = 1.0 + 0.5 * np.sin(np.arange(1200)[None, :, None] / 60 + np.array([0.0, 2.0]))
+    u = 0.5 + 0.05 / distances + np.repeat(generator.normal(0, 0.004, (1, 1200, 1)), 2, axis=-1)
+    found = calibration.follow(replace(synthetic.walk(1, 1200), u=u, distances=distances))
+    assert found["score"] > 0.99  # the noise is the same in both eyes
+    assert 0.8 < found["left"] < found["score"]
+
+
+def rows_of(study: str) -> list[dict]:
+    rate = {"per_100_m": asdict(scores.poisson_rate(2, 0.9)), "distance": 90.0, "collisions": 2}
+    if study == "velocity":
+        row = {"obstructed": 0.6, "free": 0.55, "spread": 0.02}
+        return [row | {"velocity": v, "effect": v, "speed": 0.05 * v} for v in (0.1, 1.0, 5.0)]
+    if study == "teaching":
+        pupils = [{"driver": "learned", "rule": "2a", "variant": "lstm", "start": start} | rate for start in range(3)]
+        return [{"driver": "teacher", "rule": "2a"} | rate, {"driver": "direct", "rule": "teacher"} | rate, *pupils]
+    if study == "printed":
+        stuck = {"per_100_m": asdict(scores.poisson_rate(0, 0.001)), "distance": 0.1, "collisions": 0}
+        row = {"case": "eq. 15", "speed": 0.05, "u": {"score": 0.7, "left": 0.5, "right": 0.6}}
+        return [row | {"teacher": rate, "learned": rate}, row | {"case": "eq. 1", "teacher": stuck, "learned": stuck}]
+    axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | rate for v in (0.5, 1.0)]
+    return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | rate for k in range(2)]
+
+
+@pytest.mark.parametrize("study", [velocity, teaching, printed, sensitivity], ids=lambda study: study.__name__)
+def test_figures_can_be_drawn(study):
+    figure = study.draw(rows_of(study.__name__.rpartition(".")[2]))
+    assert figures.to_svg(figure) == figures.to_svg(study.draw(rows_of(study.__name__.rpartition(".")[2])))
+    assert any(axes.lines or axes.patches for axes in figure.axes)
+
+
+def test_between_two_pictures_u_stands(robot):
+    """With a picture every third frame u changes with every third frame only, and is that of the pictures."""
+    room = crew.rooms_of(0, 0, 1)
+    room = jax.tree.map(lambda leaf: leaf[0], room)
+    model = hexapod.build()
+    slow = replace(robot, every=jnp.asarray(3, jnp.int32))
+    state = simulation.init(slow, model, room, crew.drivers.ANYONE)
+    look = jax.jit(lambda state: simulation.sense(slow, room.arena, state)[0])
+    seen = []
+    for frame in range(7):
+        state = replace(state, frame=jnp.asarray(frame, jnp.int32), fresh=jnp.asarray(frame == 0))
+        moved = replace(state.data, qpos=state.data.qpos.at[0].add(0.01))
+        state = look(replace(state, data=moved))
+        seen.append(np.asarray(state.response.u))
+    changed = [bool(np.any(before != after)) for before, after in pairwise(seen)]
+    assert changed == [False, False, True, False, False, True]
