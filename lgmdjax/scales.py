@@ -131,7 +131,6 @@ _SMALL = Eyes(width=64, height=48, pooling=2)
 _QUICK = Eyes(width=80, height=60, pooling=3)
 _SMALLER = Eyes(width=160, height=120, pooling=6)
 _PAPER = Eyes(width=320, height=240, pooling=12)
-_BENCH = Bench(eyes=_QUICK, robots=16, seconds=120)
 _SOME = ("teacher", "learned", "blind")
 
 SCALES: Mapping[Scale, Mapping[str, Any]] = {
@@ -165,12 +164,12 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "fit-gait": FitGait(steps=6000, seconds=20),
         "collect": Collect(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
         "train": Train(
-            eyes=_SMALLER, epochs=200, rounds=8, round_epochs=60, robots=16, round_seconds=120, halves_epochs=1000
+            eyes=_QUICK, epochs=80, rounds=12, round_epochs=60, robots=32, round_seconds=60, halves_epochs=1000
         ),
         "evaluate": Evaluate(
             places=(
-                Place(trial="testing", eyes=_PAPER, seeds=5),
-                Place(trial="unseen", eyes=_SMALLER, seeds=64),
+                Place(trial="testing", eyes=_PAPER, seeds=5, drivers=_SOME),
+                Place(trial="unseen", eyes=_QUICK, seeds=64),
                 Place(trial="tube", eyes=_PAPER, seeds=8, drivers=_SOME),
                 Place(trial="indoor", eyes=_PAPER, seeds=12, drivers=_SOME),
                 Place(trial="outdoor", eyes=_PAPER, seeds=10, drivers=_SOME),
@@ -181,13 +180,13 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         ),
         "velocity": Velocity(bench=Bench(eyes=_SMALLER, robots=16, seconds=20)),
         "teaching": Teaching(
-            bench=_BENCH,
-            practice=Train(eyes=_QUICK, epochs=100, rounds=2, round_epochs=60, robots=16, round_seconds=60),
+            bench=Bench(eyes=_QUICK, robots=16, seconds=90),
+            practice=Train(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=60),
             lesson_seconds=30,
             seeds=3,
         ),
         "printed": Printed(bench=Bench(eyes=_QUICK, robots=16, seconds=60)),
-        "sensitivity": Sensitivity(bench=_BENCH, epochs=100, seeds=3),
+        "sensitivity": Sensitivity(bench=Bench(eyes=_QUICK, robots=16, seconds=60), epochs=60, seeds=2),
         "report": Report(video_seconds=30),
     },
 }

@@ -16,7 +16,7 @@ from lgmdjax import episodes, hexapod, rollout, scores, simulation
 from lgmdjax.stages import crew
 
 ROOT = Path(__file__).parent.parent
-SEEDS = 4
+SEEDS = 2
 
 
 def trial(*arguments: str) -> subprocess.CompletedProcess:
