@@ -31,7 +31,8 @@ def main(run: tyro.conf.Positional[Path], robots: int = 8, overlaps: Sequence[fl
     """
     facts = read_json(run / "run.json")
     settings, seed = facts["settings"]["collect"], facts["seed"]
-    detector, eyes = collect.load_detector(run / "collect"), crew.eyes(scales.Eyes(**settings["eyes"]))
+    seen = scales.Eyes(**settings["eyes"])
+    detector, eyes = replace(collect.load_detector(run / "collect"), pooling=seen.pooling), crew.eyes(seen)
     walks, numbers = episodes.read(run / "collect" / "episodes"), range(settings["episodes"])
     records = [episodes.batched([walk for walk in walks if walk.episode == number][:robots]) for number in numbers]
     rooms = [crew.rooms_of(seed, number, settings["robots"]).arena for number in numbers]

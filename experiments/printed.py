@@ -3,13 +3,13 @@
 `python experiments/printed.py --help`; 10 minutes on two cores.
 """
 
-import tyro
+import sys
 
-from lgmdjax.cli import import_physics, prepare_jax
+from lgmdjax.cli import guarded, import_physics, prepare_jax
 
 if __name__ == "__main__":
     prepare_jax()
     import_physics()
     from lgmdjax.studies import alone
 
-    tyro.cli(alone.command("printed"))
+    sys.exit(guarded(lambda: alone.run("printed")))

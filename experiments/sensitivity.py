@@ -5,13 +5,13 @@
 Pupils of less data learn from the walks of a run: name one that is trained, `--run runs/quick-0`.
 """
 
-import tyro
+import sys
 
-from lgmdjax.cli import import_physics, prepare_jax
+from lgmdjax.cli import guarded, import_physics, prepare_jax
 
 if __name__ == "__main__":
     prepare_jax()
     import_physics()
     from lgmdjax.studies import alone
 
-    tyro.cli(alone.command("sensitivity"))
+    sys.exit(guarded(lambda: alone.run("sensitivity")))

@@ -1,18 +1,19 @@
 """Train the controller that comes with the package: `python experiments/train_controller.py` (half an hour, two cores).
 
-As `lgmdjax train --scale paper` does, but in more rooms, and without the networks that the paper's is compared with.
+As `lgmdjax train --scale paper` does, but for the networks that the paper's is compared with.
 The eyes have pictures of 80 x 60, whose cells look at as many degrees as those of the paper's 320 x 240 do, and say the
 same (the difference of the two u correlates with 0.996): the walk is ten times as fast. Interrupted, the same command
 carries on.
 """
 
 import shutil
+import sys
 from pathlib import Path
 
 import tyro
 
 from lgmdjax import scales
-from lgmdjax.cli import import_physics, prepare_jax
+from lgmdjax.cli import guarded, import_physics, prepare_jax
 from lgmdjax.runs import execute, open_run
 from lgmdjax.stages import STAGES, crew
 
@@ -43,4 +44,4 @@ def main(out: Path = Path("runs"), seed: int = 0) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    sys.exit(guarded(lambda: tyro.cli(main)))

@@ -60,8 +60,7 @@ def _round(
 ) -> list[Walk]:  # fmt: skip
     """Fit the navigator to all walks so far, let it drive one episode, and return all that it walked, labelled."""
     place = folder / "walks" / f"round-{number}"
-    facts = {"settings": asdict(settings), "round": number, "variant": variant}
-    if not episodes.Writer(place, facts).chunks:
+    if not crew.has_walked(place, settings.robots):
         train, test = tapes.split_by_room(episodes.stretches(walks), KEPT_BACK, seed)
         fit = training.fit(
             navigator.create(jax.random.key(seed), variant),
@@ -70,11 +69,11 @@ def _round(
             training.Settings(epochs=settings.round_epochs),
             checkpoints=folder / "checkpoints" / f"round-{number}",
         )
-        robot = crew.taught(robot, training.enliven(fit.best, test))
-    episode = OWN_WALKS + number
-    rooms, label = crew.rooms_of(seed, episode, settings.robots), f"practice {number + 1} of {settings.rounds}"
-    how = {"seed": seed, "facts": facts, "label": label}
-    crew.walked(place, robot, rooms, settings.round_seconds, drivers.LEARNED, **how)
+        pupil = crew.taught(robot, training.enliven(fit.best, test))
+        facts = {"settings": asdict(settings), "round": number, "robot": crew.digest(pupil)}
+        how = {"seed": seed, "facts": facts, "label": f"practice {number + 1} of {settings.rounds}"}
+        rooms = crew.rooms_of(seed, OWN_WALKS + number, settings.robots)
+        crew.walked(place, pupil, rooms, settings.round_seconds, drivers.LEARNED, **how)
     return _numbered(place, number)
 
 

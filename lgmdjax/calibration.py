@@ -149,6 +149,8 @@ def follow(record: Record) -> dict[str, float]:
     """Correlate what the eyes of recorded walks said with nearness, as `choose` does for its candidates."""
     sound = _sound(record)
     averaged = ndimage.uniform_filter1d(np.asarray(record.u), round(AVERAGED * FRAME_RATE), axis=1)[sound]
+    if not sound.any():  # as of a robot that falls at once
+        return dict.fromkeys(("score", "left", "right"), 0.0)
     return _agreement(averaged, 1 / np.asarray(record.distances)[sound])
 
 

@@ -58,7 +58,7 @@ def train(pipeline: Flags) -> None:
 
 
 def evaluate(pipeline: Flags) -> None:
-    """Walk all drivers through unseen rooms (and do the stages before, if they are not there)."""
+    """Walk all drivers in the paper's experiments and in unseen rooms (and do the stages before, if need be)."""
     _execute(pipeline, "evaluate")
 
 
@@ -162,17 +162,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lgmdjax {__version__}")
         return 0
     prepare_jax()
-    try:
-        code = tyro.extras.subcommand_cli_from_dict(
+    return guarded(
+        lambda: tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="lgmdjax", args=arguments, description="A hexapod with the eyes of a locust."
         )
+    )
+
+
+def guarded(command: Callable[[], int | None]) -> int:
+    """Run a command; give its exit code, after a line on stderr where the user can mend it."""
+    try:
+        return command() or 0
     except (InputError, OSError) as error:
         print(f"lgmdjax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("lgmdjax: interrupted; the same command carries on", file=sys.stderr)
         return 130
-    return code or 0
 
 
 def _execute(pipeline: Pipeline, target: str) -> Path:

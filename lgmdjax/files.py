@@ -13,6 +13,8 @@ import numpy as np
 
 from lgmdjax.errors import InputError
 
+COMMANDS = ("fit-gait", "collect", "train", "evaluate", "report")  # that make a folder of their name
+
 
 def write_json(path: Path, content: Any) -> None:
     """Write a JSON file whole or not at all."""
@@ -36,7 +38,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
     """Tell which file could not be read, and the command that makes it."""
-    command = "reproduce" if path.name == "run.json" else path.parent.name.partition(".")[0]
+    folder = path.parent.name.partition(".")[0]
+    command = folder if path.name != "run.json" and folder in COMMANDS else "reproduce"
     try:
         yield
     except FileNotFoundError as error:

@@ -127,6 +127,7 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "passed": passed,
         "kinds": {place: counts for place, counts in kinds.items() if any(counts.values())},
         "meanings": collisions.KINDS,
+        "coarse": _coarse(facts["settings"]),
         "experiments": trials.TRIALS,
         "studied": studied,
         "pupils": teaching.pooled(studied.get("teaching", [])),
@@ -136,9 +137,17 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "places": PLACES,
         "looks_at": LOOKS_AT,
         "learners": LEARNERS,
-        "film_length": video_seconds,
         "nominal": NOMINAL,
     }
+
+
+def _coarse(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Tell where pictures were smaller than the paper's, and how large they were."""
+    train, paper = settings["train"].get("eyes"), camera.Params()
+    eyes = {"while it learned": train} if train else {}
+    eyes |= {f"in {PLACES[place['trial']]}": place["eyes"] for place in settings["evaluate"]["places"]}
+    small = {where: (e["width"], e["height"]) for where, e in eyes.items() if e["width"] < paper.width}
+    return {where: f"{width} × {height}" for where, (width, height) in small.items()}
 
 
 def verdict(scores: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,11 +1,12 @@
 """Made-up walks, and a run folder as the stages leave it, with plausible numbers."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from lgmdjax import arena
+from lgmdjax import arena, scores
 from lgmdjax.collisions import KINDS
 from lgmdjax.simulation import FRAME_RATE, Record
 
@@ -85,6 +86,42 @@ def score(rate: float) -> dict:
         "speed": 0.0587,
         "turning": 0.113,
     }
+
+
+def rows_of(study: str) -> list[dict]:
+    """Rows of a study as it writes them."""
+    rate = {"per_100_m": asdict(scores.poisson_rate(2, 0.9)), "distance": 90.0, "collisions": 2}
+    if study == "velocity":
+        row = {"obstructed": 0.6, "free": 0.55, "spread": 0.02}
+        return [row | {"velocity": v, "effect": v, "speed": 0.05 * v} for v in (0.1, 1.0, 5.0)]
+    if study == "teaching":
+        pupils = [{"driver": "learned", "rule": "2a", "variant": "lstm", "start": start} | rate for start in range(3)]
+        return [{"driver": "teacher", "rule": "2a"} | rate, {"driver": "direct", "rule": "teacher"} | rate, *pupils]
+    if study == "printed":
+        stuck = {"per_100_m": asdict(scores.poisson_rate(0, 0.001)), "distance": 0.1, "collisions": 0}
+        row = {"case": "eq. 15", "speed": 0.05, "u": {"score": 0.7, "left": 0.5, "right": 0.6}}
+        return [row | {"teacher": rate, "learned": rate}, row | {"case": "eq. 1", "teacher": stuck, "learned": stuck}]
+    axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | rate for v in (0.5, 1.0)]
+    return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | rate for k in range(2)]
+
+
+def write_experiments(run: Path) -> Path:
+    """Add to a run folder what `--scale paper` has beside: a trial that ends, and the studies."""
+    facts = json.loads((run / "run.json").read_text())
+    facts["settings"]["evaluate"]["places"].append({"trial": "tube", "eyes": {"width": 320, "height": 240}})
+    for study in ("velocity", "teaching", "printed", "sensitivity"):
+        facts["settings"][study] = {"bench": {"robots": 16}}
+        (run / study).mkdir()
+        (run / study / "done.json").write_bytes((run / "train" / "done.json").read_bytes())
+        _json(run / study / f"{study}.json", rows_of(study))
+    _json(run / "run.json", facts)
+    evaluation = json.loads((run / "evaluate" / "evaluation.json").read_text())
+    outcome = {"robots": 30, "untouched": 29, "retreated": 4, "clearance": [0.1] * 30, "seconds": [20.0] * 30}
+    outcome["avoided"] = asdict(scores.wilson(29, 30))
+    evaluation["tube"] = dict.fromkeys(("teacher", "learned", "blind"), outcome)
+    _json(run / "evaluate" / "evaluation.json", evaluation)
+    (run / "evaluate" / "tube.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
+    return run
 
 
 def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (240, 320)) -> Path:

@@ -58,9 +58,9 @@ def test_leaves_a_picture_and_a_film(folder):
 def test_is_done_once_and_refuses_other_settings(out):
     again = trial("indoor", "--seeds", str(SEEDS), "--out", str(out))
     assert again.returncode == 0 and "up to date" in again.stdout
-    other = trial("indoor", "--seeds", "2", "--out", str(out))
+    other = trial("indoor", "--seeds", "3", "--out", str(out))
     assert other.returncode == 2
-    assert "seeds = 2" in other.stderr and other.stderr.count("\n") == 1
+    assert "seeds = 3" in other.stderr and other.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(

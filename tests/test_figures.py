@@ -54,7 +54,16 @@ def drawn(run: Path) -> dict[str, Figure]:
             synthetic.room(), {name: walks(paths, name) for name in synthetic.DRIVERS}
         ),
         "drivers": figures.drivers(evaluation),
+        "passages": passages(paths["testing_learned"]),
     }
+
+
+def passages(positions: np.ndarray) -> Figure:
+    """Five ways past something, of which the first ends in a touch."""
+    robots = len(positions)
+    touched, across = np.arange(robots) == 0, np.linspace(0, 0.4, robots)
+    rooms, ways = [synthetic.room()] * robots, list(positions[..., :2])
+    return figures.passages(rooms, ways, touched, np.where(touched, -0.01, 0.1), across)
 
 
 def walks(paths: dict[str, np.ndarray], driver: str) -> figures.Walks:
@@ -71,6 +80,7 @@ NAMES = (
     "stretch",
     "trajectories",
     "drivers",
+    "passages",
 )
 
 
@@ -206,3 +216,20 @@ def test_the_mean_over_a_second_lies_on_what_does_not_flicker(run: Path):
     left, right = (line for line in axes.lines if line.get_alpha() is None)
     np.testing.assert_allclose(np.asarray(left.get_ydata())[30:-30], 0.6, atol=1e-6)
     np.testing.assert_allclose(right.get_ydata(), 0.7)
+
+
+def test_passages_mark_touches_and_draw_clearance_against_the_offset(drawn):
+    above, below = drawn["passages"].axes
+    ends = [line for line in above.lines if line.get_marker() in ("o", "X") and len(line.get_xdata()) == 1]
+    assert [line.get_marker() for line in ends].count("X") == 1
+    assert "4 of 5" in above.get_title(loc="left")
+    clear, touched = below.lines
+    np.testing.assert_allclose(clear.get_ydata(), 10.0)
+    np.testing.assert_allclose(touched.get_ydata(), 0.0)
+    np.testing.assert_allclose(touched.get_xdata(), 0.0)
+
+
+def test_rooms_are_drawn_side_by_side(run):
+    paths = dict(np.load(run / "evaluate/trajectories.npz"))
+    figure = figures.rooms([synthetic.room()] * 4, [walks(paths, name) for name in synthetic.DRIVERS[:4]])
+    assert len(figure.axes) == 4

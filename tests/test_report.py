@@ -243,3 +243,19 @@ def test_the_page_can_go_elsewhere(copy: Path, tmp_path: Path):
     assert path == tmp_path / "elsewhere" / "index.html"
     assert not (copy / "report").exists()
     assert "fit-gait12.5cpu" in Page(path.read_text(encoding="utf-8")).text.replace(" ", "")
+
+
+def test_experiments_and_studies_have_their_sections_where_there_are_some(copy: Path):
+    assert "experiments with obstacles" not in text_of(copy) and "Studies" not in text_of(copy)
+    text = text_of(synthetic.write_experiments(copy))
+    for said in (
+        "a single obstacle 15 of 15 29 of 30",
+        "83 to 99 %",  # Wilson's interval of 29 in 30
+        "furthest apart at v = 5",
+        "lstm, taught by 2a 3 270 6 2.22",
+        "As printed against corrected",
+        "How far may things be from what was chosen?",
+        "80 × 60 in the testing room",
+    ):
+        assert said in text
+    assert "320 × 240 in a single obstacle" not in text

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, replace
 from itertools import pairwise
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -77,14 +78,14 @@ def test_starts_of_a_case_are_pooled():
 def test_an_erratum_changes_one_thing(robot):
     before = leaves(robot)
     for name in ("eqs. 1, 3: coupling W", "eq. 22: rule alone"):
-        after = leaves(printed.CASES[name](robot, 0))
+        after = leaves(printed.CASES[name](robot, Path()))
         changed = {path for path in before if not np.array_equal(before[path], after[path])}
         assert changed and all(
             ("coupling" in path) or ("full_turn" in path) or ("symmetry" in path) for path in changed
         )
-    assert printed.CASES["eq. 16: gate"](robot, 0).controller.lgmd.printed_gate
-    assert printed.CASES["eq. 15: signed sum"](robot, 0).controller.lgmd.printed_feed_forward
-    assert printed.CASES["eqs. 1, 3: sign of w_fe"](robot, 0).controller.cpg.printed_sign
+    assert printed.CASES["eq. 16: gate"](robot, Path()).controller.lgmd.printed_gate
+    assert printed.CASES["eq. 15: signed sum"](robot, Path()).controller.lgmd.printed_feed_forward
+    assert printed.CASES["eqs. 1, 3: sign of w_fe"](robot, Path()).controller.cpg.printed_sign
 
 
 def test_every_axis_of_sensitivity_has_the_chosen_value_once(robot):
@@ -147,26 +148,11 @@ def test_follow_agrees_with_correlation_of_what_was_recorded():
     assert 0.8 < found["left"] < found["score"]
 
 
-def rows_of(study: str) -> list[dict]:
-    rate = {"per_100_m": asdict(scores.poisson_rate(2, 0.9)), "distance": 90.0, "collisions": 2}
-    if study == "velocity":
-        row = {"obstructed": 0.6, "free": 0.55, "spread": 0.02}
-        return [row | {"velocity": v, "effect": v, "speed": 0.05 * v} for v in (0.1, 1.0, 5.0)]
-    if study == "teaching":
-        pupils = [{"driver": "learned", "rule": "2a", "variant": "lstm", "start": start} | rate for start in range(3)]
-        return [{"driver": "teacher", "rule": "2a"} | rate, {"driver": "direct", "rule": "teacher"} | rate, *pupils]
-    if study == "printed":
-        stuck = {"per_100_m": asdict(scores.poisson_rate(0, 0.001)), "distance": 0.1, "collisions": 0}
-        row = {"case": "eq. 15", "speed": 0.05, "u": {"score": 0.7, "left": 0.5, "right": 0.6}}
-        return [row | {"teacher": rate, "learned": rate}, row | {"case": "eq. 1", "teacher": stuck, "learned": stuck}]
-    axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | rate for v in (0.5, 1.0)]
-    return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | rate for k in range(2)]
-
-
 @pytest.mark.parametrize("study", [velocity, teaching, printed, sensitivity], ids=lambda study: study.__name__)
 def test_figures_can_be_drawn(study):
-    figure = study.draw(rows_of(study.__name__.rpartition(".")[2]))
-    assert figures.to_svg(figure) == figures.to_svg(study.draw(rows_of(study.__name__.rpartition(".")[2])))
+    rows = synthetic.rows_of(study.__name__.rpartition(".")[2])
+    figure = study.draw(rows)
+    assert figures.to_svg(figure) == figures.to_svg(study.draw(rows))
     assert any(axes.lines or axes.patches for axes in figure.axes)
 
 

@@ -26,6 +26,7 @@ from lgmdjax import (
     shaping,
     simulation,
 )
+from lgmdjax.errors import InputError
 from lgmdjax.files import read_arrays
 
 DATA = Path(__file__).parent.parent / "data"
@@ -53,8 +54,13 @@ def trained(gait: Path = DATA, train: Path = DATA) -> simulation.Params:
     """
     learned, header = navigator.load(train / "controller.safetensors")
     baselines = read_arrays(train / "baselines.npz")
-    crew = everyone(learned, float(baselines["gain"]), baselines["replayed"])
-    return robot(gait, scales.Eyes(**header["eyes"]), lgmd.Params(**header["lgmd"]), crew)
+    try:
+        crew = everyone(learned, float(baselines["gain"]), baselines["replayed"])
+        return robot(gait, scales.Eyes(**header["eyes"]), lgmd.Params(**header["lgmd"]), crew)
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{train}: expected a navigator and baselines as `lgmdjax train` leaves them, got {error}; train again"
+        ) from error
 
 
 def with_eyes(params: simulation.Params, settings: scales.Eyes) -> simulation.Params:
@@ -179,6 +185,11 @@ def walked(
     for numbers, record in walks:
         writer.write(record, episode=writer.chunks, rooms=numbers, seed=seed)
     return episodes.batched(episodes.read(folder))
+
+
+def has_walked(folder: Path, robots: int) -> bool:
+    """Tell whether all crowds of so many robots are in a folder of `walked`."""
+    return len(list(folder.glob("chunk-*.parquet"))) * min(CROWD, robots) >= robots
 
 
 def benched(

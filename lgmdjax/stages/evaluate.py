@@ -56,7 +56,10 @@ def _walk(folder: Path, place: scales.Place, robot: simulation.Params, driver: s
 def _kinds(
     settings: scales.Evaluate, walked: Mapping[str, Mapping[str, simulation.Record]], seed: int
 ) -> dict[str, dict[str, int]]:
-    """Count the kinds of the learned controller's collisions in each trial; nothing if it walked too little to tell."""
+    """Count the kinds of the learned controller's collisions in each trial; nothing if it walked too little to tell.
+
+    What u is with nothing near is that of the unseen rooms, whatever the eyes: cells of one size say the same.
+    """
     try:
         yardstick = collisions.measure(walked["unseen"]["learned"])
     except InputError:

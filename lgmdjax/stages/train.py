@@ -38,8 +38,8 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
         start = navigator.create(jax.random.key(seed), variant)
         return training.fit(start, train, test, epochs, checkpoints=folder / "checkpoints" / name)
 
-    chosen = [variant for variant in navigator.VARIANTS if variant in settings.variants]
-    fits = {str(variant): fit(variant, variant, train, test) for variant in chosen}
+    chosen: list[navigator.Variant] = [name for name in navigator.VARIANTS if name in settings.variants]
+    fits: dict[str, training.Fit] = {variant: fit(variant, variant, train, test) for variant in chosen}
     shown = {walk.room for walk in train}
     # The paper halves every stretch; but a stretch ends where the robot touched something, so that its second half is
     # what a controller must learn most. One fit to the teacher's walks in halves stands beside.

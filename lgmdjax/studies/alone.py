@@ -2,12 +2,28 @@
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any
+
+import tyro
 
 from lgmdjax import figures, files, scales
 from lgmdjax.runs import Stage, execute, open_run
 from lgmdjax.stages import crew
+
+ARGUMENTS = """
+Args:
+    settings: how much of it
+    run: folder of the run whose robot walks; the one that comes along if left out
+    seed: of rooms and starts
+    out: the results go into a folder of the study's name in here
+"""
+
+
+def run(study: str) -> None:
+    """Read the flags of a study from the command line, and do it."""
+    tyro.cli(command(study))
 
 
 def command(study: str) -> Callable[..., None]:
@@ -26,13 +42,7 @@ def command(study: str) -> Callable[..., None]:
         place = open_run(out, f"{study}-{seed}", "study", seed, {study: settings, "robot": robot})
         print(f"look into {execute(place, (Stage(name=study, work=work),), study)}")
 
-    main.__doc__ = f"""{module.__doc__}
-    Args:
-        settings: how much of it
-        run: folder of the run whose robot walks; the one that comes along if left out
-        seed: of rooms and starts
-        out: the results go into a folder of the study's name in here
-    """
+    main.__doc__ = f"{cleandoc(module.__doc__ or '')}\n\n{cleandoc(ARGUMENTS)}"
     main.__annotations__["settings"] = type(default)
     return main
 

@@ -40,13 +40,18 @@ from lgmdjax.studies import teaching
 SECONDS = 20.0  # on the empty floor
 WALKED = 5.0  # m; of a robot that walks less there is no rate to tell
 STEPS = 3000  # of fitting networks to the paper's input
-Change = Callable[[simulation.Params, int], simulation.Params]
+Change = Callable[[simulation.Params, Path], simulation.Params]  # a robot, and the study's folder
 
 
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Printed, seed: int) -> None:
     """Put every erratum into the robot, and measure."""
     robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
-    rows = [_measure(folder, name, change(robot, seed), settings, seed) for name, change in CASES.items()]
+    literal = folder / "literal.safetensors"
+    if not literal.exists():  # bits of a second fit might differ, and so would the robot
+        geometry = legs.geometry(hexapod.load())
+        networks = lesson.teach(geometry, key=jax.random.key(seed), steps=STEPS, literal=True)
+        shaping.save(literal, networks, {"steps": STEPS, "seed": seed})
+    rows = [_measure(folder, name, change(robot, folder), settings, seed) for name, change in CASES.items()]
     files.write_json(folder / "printed.json", rows)
 
 
@@ -65,7 +70,7 @@ def _measure(folder: Path, name: str, robot: simulation.Params, settings: scales
 
 
 def _rhythm(**changes: Any) -> Change:
-    def change(robot: simulation.Params, _: int) -> simulation.Params:
+    def change(robot: simulation.Params, _: Path) -> simulation.Params:
         changed = {name: value if isinstance(value, bool) else jnp.asarray(value) for name, value in changes.items()}
         return replace(robot, controller=replace(robot.controller, cpg=replace(robot.controller.cpg, **changed)))
 
@@ -73,16 +78,15 @@ def _rhythm(**changes: Any) -> Change:
 
 
 def _detector(**changes: bool) -> Change:
-    def change(robot: simulation.Params, _: int) -> simulation.Params:
+    def change(robot: simulation.Params, _: Path) -> simulation.Params:
         return replace(robot, controller=replace(robot.controller, lgmd=replace(robot.controller.lgmd, **changes)))
 
     return change
 
 
-def _literal(robot: simulation.Params, seed: int) -> simulation.Params:
+def _literal(robot: simulation.Params, folder: Path) -> simulation.Params:
     """Give the robot networks that hear what the paper's do."""
-    geometry = legs.geometry(hexapod.load())
-    networks: shaping.Params = lesson.teach(geometry, key=jax.random.key(seed), steps=STEPS, literal=True)
+    networks = shaping.load(folder / "literal.safetensors")
     return replace(robot, controller=replace(robot.controller, shaping=networks))
 
 

@@ -42,6 +42,7 @@ CELLS = (1, 2, 3, 4, 6)
 EVERY = (1, 2, 3, 4)  # frames from one picture to the next
 CONTRASTS = (0.25, 0.5, 0.75, 1.0, 1.25)
 SWAYS = (0.0, 1.0, 2.0, 4.0)
+SHORTEST = 30  # frames of a stretch that is cut
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the minutes recorded
 ROOMS = (2, 4, 8, 16, 32, 64)
 AXES = {
@@ -61,10 +62,11 @@ AXES = {
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity, seed: int) -> None:
     """Score the robot with every change, and every pupil."""
     robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+    recorded = _recorded(inputs)  # before hours of walking
     rows, chosen = [], settled(settings.bench.eyes)
     for axis, value, changed, contrast in changes(robot, settings.bench.eyes):
         rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
-    for axis, value, walks in lessons(_recorded(inputs), seed):
+    for axis, value, walks in lessons(recorded, seed):
         for start in range(settings.seeds):
             place = folder / "pupils" / f"{axis}-{value:g}-{start}"
             pupil = crew.taught(robot, _fit(place, walks, settings.epochs, seed + start))
@@ -106,24 +108,45 @@ def changes(robot: simulation.Params, eyes: scales.Eyes) -> Iterator[tuple[str, 
 
 
 def lessons(walks: Sequence[Walk], seed: int) -> Iterator[tuple[str, float, list[Walk]]]:
-    """Yield (axis, value, stretches to learn from) for parts of what was recorded.
+    """Yield (axis, value, stretches to learn from) for parts of what was recorded, drawn at random.
 
-    Minutes are taken from the beginning of every room's walks. Rooms are drawn at random and all get the same time in
-    all: as much as the fewest rooms have.
+    All that learn from a number of rooms get the same time: as much as the fewest rooms have.
     """
+    generator = np.random.default_rng(seed)
     stretches = episodes.stretches(walks)
-    minutes = sum(map(len, stretches)) / FRAME_RATE / 60
+    stretches = [stretches[k] for k in generator.permutation(len(stretches))]
+    frames = sum(map(len, stretches))
     for share in SHARES:
-        part = (stretch[: max(round(share * len(stretch)), 1)] for stretch in stretches)
-        yield "minutes", share * minutes, [stretch for stretch in part if len(stretch) >= 2]
-    rooms = np.random.default_rng(seed).permutation(sorted({stretch.room for stretch in stretches}))
+        yield "minutes", share * frames / FRAME_RATE / 60, _cut(stretches, round(share * frames))
+    rooms = generator.permutation(sorted({stretch.room for stretch in stretches}))
     few = {count: set(rooms[:count].tolist()) for count in ROOMS if count <= len(rooms)}
-    frames = sum(len(stretch) for stretch in stretches if stretch.room in few[ROOMS[0]])
-    for count, chosen in few.items():
-        some = [stretch for stretch in stretches if stretch.room in chosen]
-        share = min(frames / sum(map(len, some)), 1.0)
-        part = (stretch[: max(round(share * len(stretch)), 1)] for stretch in some)
-        yield "rooms", count, [stretch for stretch in part if len(stretch) >= 2]
+    shown = {count: [stretch for stretch in stretches if stretch.room in some] for count, some in few.items()}
+    least = min(sum(map(len, some)) for some in shown.values())
+    for count, some in shown.items():
+        yield "rooms", count, _evenly(some, least)
+
+
+def _cut(stretches: Sequence[Walk], frames: int) -> list[Walk]:
+    """Take stretches until there are so many frames; the last one is cut."""
+    starts = np.cumsum([0, *map(len, stretches)])
+    return [
+        stretch[: frames - start]
+        for start, stretch in zip(starts.tolist(), stretches, strict=False)
+        if frames - start >= SHORTEST
+    ] or [stretches[0][:frames]]
+
+
+def _evenly(stretches: Sequence[Walk], frames: int) -> list[Walk]:
+    """Take as many frames of every room, as far as there are, until there are so many in all."""
+    rooms: dict[int, list[Walk]] = {}
+    for stretch in stretches:
+        rooms.setdefault(stretch.room, []).append(stretch)
+    left, chosen = frames, []
+    for number, some in enumerate(sorted(rooms.values(), key=lambda some: sum(map(len, some)))):
+        share = min(left // (len(rooms) - number), sum(map(len, some)))
+        chosen += _cut(some, share)
+        left -= share
+    return chosen
 
 
 def _recorded(inputs: Mapping[str, Path]) -> list[Walk]:

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from scipy import ndimage
 
 from lgmdjax import calibration, cpg, drivers, figures, files, scales, scores, simulation
+from lgmdjax.errors import InputError
 from lgmdjax.stages import crew
 
 NEAR, FAR = 0.6, 1.2  # m
@@ -69,6 +70,11 @@ def measure(velocity: float, record: simulation.Record, suppression: float) -> R
     u = ndimage.uniform_filter1d(np.asarray(record.u).mean(axis=-1), WINDOW, axis=1)
     steady, distance = _steady(record), np.asarray(record.distances).min(axis=-1)
     near, far = u[steady & (distance < NEAR)], u[steady & (distance > FAR)]
+    if not (len(near) and len(far)):
+        raise InputError(
+            f"velocity {velocity:g}: expected frames with something within {NEAR} m and frames with nothing within "
+            f"{FAR} m, got {len(near)} and {len(far)}; walk more robots, or for longer"
+        )
     spread = float(np.sqrt((near.var() * len(near) + far.var() * len(far)) / (len(near) + len(far))))
     scored = scores.score(record, cpg.CYCLE_TIME)
     return Row(
@@ -88,7 +94,7 @@ def _steady(record: simulation.Record) -> Bool[np.ndarray, "robots frames"]:
     setbacks = np.asarray(record.setbacks)
     steady = np.zeros(setbacks.shape, bool)
     for robot, first, last in scores.stretches(setbacks):
-        steady[robot, first + 2 * round(simulation.FRAME_RATE) : last - WINDOW] = True
+        steady[robot, first + 2 * round(simulation.FRAME_RATE) : max(last - WINDOW, 0)] = True
     return steady & np.asarray(record.ok)
 
 

@@ -1,0 +1,79 @@
+"""Practice: who walks, what is learned from, and what a kill between two crowds leaves."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from synthetic import walk
+
+from lgmdjax import apprentice, episodes, navigator, scales, simulation, training
+from lgmdjax.stages import crew
+
+SETTINGS = scales.Train(
+    eyes=scales.Eyes(width=16, height=12), epochs=1, rounds=2, round_epochs=1, robots=4, round_seconds=0.1
+)
+
+
+@pytest.fixture
+def drive(monkeypatch):
+    """Stand-ins for walking and fitting: crowds of two, a pupil whose outputs tell what it learned from."""
+    seen = []
+
+    def fit(params, train, test, settings, checkpoints):
+        taught = replace(params, output_mean=np.full(2, 1.0 + len(train) + len(test)))
+        return training.Fit(params=taught, best=taught, train=np.zeros(1), test=np.zeros(1))
+
+    def walks(params, model, rooms, seconds, label, *, draw):
+        pupil = next(one for one in params.controller.driver.drivers if isinstance(one, navigator.Params))
+        seen.append(float(pupil.output_mean[0]))
+        if len(seen) == drive.killed_at:
+            raise KeyboardInterrupt
+        yield walk(len(rooms.starts), frames=150)
+
+    def drive(folder, recorded, killed_at=0):
+        seen.clear()
+        drive.killed_at = killed_at
+        robot = simulation.assemble(crew.everyone())
+        return apprentice.practise(folder, robot, recorded, SETTINGS, seed=0), list(seen)
+
+    monkeypatch.setattr(crew, "CROWD", 2)
+    monkeypatch.setattr(crew, "walks", walks)
+    monkeypatch.setattr(training, "fit", fit)
+    monkeypatch.setattr(training, "enliven", lambda params, walks: params)
+    return drive
+
+
+@pytest.fixture
+def recorded():
+    fields = [{name: np.asarray(x)[k] for name, x in vars(walk(8, frames=150)).items()} for k in range(8)]
+    return [episodes.Walk(episode=0, robot=k, room=k, seed=0, **fields[k]) for k in range(8)]
+
+
+def test_every_round_learns_from_all_walks_so_far_in_rooms_of_their_own(drive, recorded, tmp_path):
+    walks, seen = drive(tmp_path, recorded)
+    assert seen == [9.0, 9.0, 13.0, 13.0]  # 8 stretches, then 4 more; two crowds each
+    assert len(walks) == 16 and len({one.room for one in walks}) == 16
+    again = apprentice.practised(tmp_path)
+    assert [one.room for one in again] == [one.room for one in walks[8:]]
+
+
+def test_after_a_kill_between_two_crowds_the_same_pupil_walks_on(drive, recorded, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        drive(tmp_path, recorded, killed_at=2)
+    walks, seen = drive(tmp_path, recorded)
+    assert seen == [9.0, 13.0, 13.0]
+    assert len(walks) == 16
+
+
+def test_what_is_done_is_not_walked_again(drive, recorded, tmp_path):
+    before, _ = drive(tmp_path, recorded)
+    after, seen = drive(tmp_path, recorded)
+    assert seen == []
+    jax.tree.map(np.testing.assert_array_equal, [vars(one) for one in before], [vars(one) for one in after])
+
+
+def test_no_room_is_in_two_of_the_three_parts(recorded):
+    parts = [{one.room for one in part} for part in apprentice.split(recorded, seed=3)]
+    assert sum(map(len, parts)) == len(set.union(*parts)) == 8
+    assert all(parts)
