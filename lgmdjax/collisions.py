@@ -49,7 +49,7 @@ KINDS = {
 }
 
 WINDOW = 2.5  # s before the touch: three gait cycles, in which a hard turn takes the robot round by 40 degrees
-FAR = 1.2  # m; where nothing is nearer, nothing is near: the rule begins to turn at 1 m
+FAR = 1.2  # m; where nothing is nearer, nothing is near: the rule begins to turn at 0.8 m
 RISEN = 0.99  # quantile of u with nothing near; surpassed in 1 of 5 to 14 windows with nothing near, 0.95 in 1 of 3
 BANDS = (0.3, 1.0, 2.0)  # nominal; between these |v_r - v_l|, u with nothing near is taken to be one thing
 LEAST = 10.0  # s of walking with nothing near that tell what u then is

@@ -164,7 +164,7 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "fit-gait": FitGait(steps=6000, seconds=20),
         "collect": Collect(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
         "train": Train(
-            eyes=_QUICK, epochs=80, rounds=12, round_epochs=60, robots=32, round_seconds=60, halves_epochs=1000
+            eyes=_QUICK, epochs=100, rounds=8, round_epochs=60, robots=16, round_seconds=120, halves_epochs=1000
         ),
         "evaluate": Evaluate(
             places=(

@@ -173,7 +173,7 @@ def _random_box(draws: Array, arena: Arena, gap: float) -> tuple[Prisms, Bool[Ar
 def _random_cylinder(draws: Array, arena: Arena, gap: float) -> tuple[Prisms, Bool[Array, ""]]:
     """Make a cylinder and find a place for it; is there one?"""
     thickness, rise = draws[:2]
-    radius = 0.05 + 0.25 * thickness
+    radius = 0.08 + 0.22 * thickness
     centre, fits = _find_place(draws[4:], arena, jnp.zeros((1, 2), dtype=float), radius, gap)
     return place(centre, radius, 0.5 + rise, count=1), fits
 
@@ -219,7 +219,7 @@ def textured(arena: Arena, key: Array | None = None) -> Arena:
         arena,
         boxes=dataclasses.replace(boxes, texture=things[:first]),
         cylinders=dataclasses.replace(cylinders, texture=things[first:]),
-        wall_texture=between(draws[second:-2], (120.0, 0.3, 0.0, 0.3), (170.0, 0.7, 2.0 * jnp.pi, 0.6)),
+        wall_texture=between(draws[second:-2], (120.0, 0.5, 0.0, 0.3), (170.0, 0.7, 2.0 * jnp.pi, 0.6)),
         floor_texture=between(draws[-2], (110.0, 0.05, 0.0, 0.2), (150.0, 0.5, 2.0 * jnp.pi, 0.5)),
         sky=200.0 + 50.0 * draws[-1, 0],
     )
