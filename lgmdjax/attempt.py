@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lgmdjax import arena, camera, cpg, drivers, figures, files, film, scores, simulation, trials
+from lgmdjax import arena, camera, cpg, drivers, figures, files, film, scales, scores, simulation, trials
 from lgmdjax.errors import InputError
 from lgmdjax.runs import Stage, execute, open_run
 from lgmdjax.simulation import FRAME_RATE, Record, Room
@@ -36,22 +36,38 @@ class Attempt:
     robot: str  # digest of all its numbers
 
 
-def attempt(name: str, driver: str, *, seed: int, seeds: int | None, run: Path | None, out: Path) -> Path:
+def attempt(
+    name: str, driver: str, *, seed: int, seeds: int | None, width: int | None, run: Path | None, out: Path
+) -> Path:
     """Walk a trial and give the folder of its files.
 
     Args:
         name: of the trial. driver: who walks. seed: of rooms, textures and starts.
         seeds: how often; as often as the trial says if None.
+        width: of the pictures, whose cells go on looking at as many degrees [px]; as it learned with if None.
         run: the run folder whose robot walks; the one that comes with the package if None.
         out: the folder to write a folder into.
     """
     if seeds is not None and seeds < 1:
         raise InputError(f"expected one or more --seeds, got {seeds}; leave it out for as many as the paper has")
     robot = crew.trained(run / "fit-gait", run / "train") if run else crew.trained()
+    robot = robot if width is None else crew.with_eyes(robot, _eyes(robot, width))
     trial = trials.TRIALS[name]
     asked = tried(robot, name, driver, seeds or trial.seeds, trial.seconds)
     place = open_run(out, f"{name}-{driver}-{seed}", "trial", seed, {"trial": asked})
     return execute(place, (Stage(name="trial", work=partial(_work, robot)),), "trial")
+
+
+def _eyes(robot: simulation.Params, width: int) -> scales.Eyes:
+    """Find eyes with pictures of another width and cells of the same size in degrees."""
+    eyes, pooling = robot.camera, robot.controller.lgmd.pooling
+    if width < 1 or (pooling * width) % eyes.width or (eyes.height * width) % eyes.width:
+        raise InputError(
+            f"expected a --width whose cells are whole pixels as the {pooling} of {eyes.width} are, got {width}; "
+            f"try {2 * eyes.width}"
+        )
+    height, cell = eyes.height * width // eyes.width, pooling * width // eyes.width
+    return scales.Eyes(width=width, height=height, overlap=eyes.overlap, pooling=cell)
 
 
 def tried(robot: simulation.Params, trial: str, driver: str, seeds: int, seconds: float) -> Attempt:

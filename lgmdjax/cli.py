@@ -123,6 +123,7 @@ def trial(
     driver: Literal["teacher", "learned", "blind", "direct", "random"] = "learned",
     seed: int = 0,
     seeds: int | None = None,
+    width: int | None = None,
     run: Path | None = None,
     out: Path = Path("runs/trials"),
 ) -> None:
@@ -133,13 +134,14 @@ def trial(
         driver: who walks
         seed: of rooms, textures and starts
         seeds: how many times; as many as the paper has, or more, if left out
+        width: of its pictures [px], 320 as in the paper; as it learned with, which says nearly the same, if left out
         run: folder of the run whose robot walks; the trained one that comes along if left out
         out: the results go into a folder of the trial's name in here
     """
     import_physics()
     from lgmdjax.attempt import attempt
 
-    print(f"look into {attempt(name, driver, seed=seed, seeds=seeds, run=run, out=out)}")
+    print(f"look into {attempt(name, driver, seed=seed, seeds=seeds, width=width, run=run, out=out)}")
 
 
 COMMANDS: dict[str, Callable[..., int | None]] = {

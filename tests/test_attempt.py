@@ -67,6 +67,7 @@ def test_is_done_once_and_refuses_other_settings(out):
     ("arguments", "line"),
     [
         (("tube", "--seeds", "0"), "expected one or more --seeds, got 0"),
+        (("tube", "--width", "100"), "expected a --width whose cells are whole pixels"),
         (("tube", "--run", "nowhere"), "`lgmdjax train` makes one"),
     ],
 )

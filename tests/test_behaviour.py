@@ -11,15 +11,23 @@ import pytest
 from lgmdjax import arena, drivers, hexapod, rollout, scales, scenes, scores, simulation
 from lgmdjax.stages import crew
 
-SECONDS = 26.0
+SECONDS = 30.0
+
+
+def beside(key: jax.Array, lateral: float) -> arena.Arena:
+    """A box of 0.5 m a side, 1 m ahead and so far to the left."""
+    box = arena.place([[1.25, lateral]], [[0.25, 0.25]], [0.8])
+    return scenes.textured(arena.empty_room((6.0, 6.0), boxes=box), key)
+
+
 SCENES = {
-    "tube": lambda key: scenes.tube_scene(0.12, key),
-    "tube far to the left": lambda key: scenes.tube_scene(0.42, key),
+    "box to the left": lambda key: beside(key, 0.2),
+    "box far to the left": lambda key: beside(key, 0.9),
     "indoor": scenes.indoor_scene,
     "outdoor": scenes.outdoor_scene,
     "dynamic": scenes.dynamic_scene,
 }
-IN_THE_WAY = ("tube", "indoor", "outdoor", "dynamic")
+IN_THE_WAY = ("box to the left", "indoor", "outdoor", "dynamic")
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +74,9 @@ def test_learned_controller_touches_nothing_that_a_blind_robot_walks_into(walks)
     assert learned.sum() >= learned.size - 1, dict(zip(SCENES, learned.tolist(), strict=True))
 
 
-def test_turns_away_from_the_tube_on_its_side_and_mirrors_when_mirrored(walks):
-    """Until it has turned by a radian, or for the whole walk: the tube stands to the left, mirrored to the right."""
-    tube = list(SCENES).index("tube")
-    turned = heading(walks["learned"])[tube]
+def test_turns_away_from_the_box_on_its_side_and_mirrors_when_mirrored(walks):
+    """Until it has turned by a radian, or for the whole walk: the box stands to the left, mirrored to the right."""
+    turned = heading(walks["learned"])[list(SCENES).index("box to the left")]
     far = np.abs(turned) > 1.0
     end = [row.argmax() if row.any() else len(row) - 1 for row in far]
     assert turned[0, end[0]] < -0.2
@@ -77,12 +84,6 @@ def test_turns_away_from_the_tube_on_its_side_and_mirrors_when_mirrored(walks):
 
 
 def test_passes_what_is_not_in_its_way(walks):
-    """A tube far to the side is passed: the robot goes on, and turns no more than it must."""
-    far = list(SCENES).index("tube far to the left")
-    assert np.all(walks["learned"].position[far, :, -1, 0] > 0.6)
-
-
-def test_turns_more_where_something_is_in_the_way(walks):
-    turning = np.abs(np.diff(walks["learned"].velocity, axis=-1))[..., 0].mean(axis=-1)
-    far, tube, indoor = (list(SCENES).index(name) for name in ("tube far to the left", "tube", "indoor"))
-    assert turning[far].mean() < min(turning[tube].mean(), turning[indoor].mean())
+    """A box far to the side does not stop it: it comes abreast of where the box begins."""
+    far = list(SCENES).index("box far to the left")
+    assert np.all(walks["learned"].position[far, :, :, 0].max(axis=-1) > 1.0)
