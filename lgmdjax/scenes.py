@@ -22,6 +22,8 @@ from lgmdjax.prisms import COUNT, Prisms, join, parked, place, turned
 
 GAP = 0.8
 """Least way between obstacles, and about a start [m]: twice the robot's width."""
+INDOORS, ANY = 0.12, 0.5
+"""Greatest contrast of a floor: in the paper's rooms, and in random ones."""
 DRAWS = 128
 """Places that an obstacle of a random room is tried at."""
 
@@ -156,7 +158,7 @@ def random_room(
         return dataclasses.replace(arena, cylinders=_put(arena.cylinders, index, cylinder, fits)), None
 
     arena, _ = jax.lax.scan(turn, arena, (jnp.arange(rounds), draws[:-1]))
-    return faded(textured(arena, texture_key), contrast)
+    return faded(textured(arena, texture_key, floor=ANY), contrast)
 
 
 def _random_box(draws: Array, arena: Arena, gap: float) -> tuple[Prisms, Bool[Array, ""]]:
@@ -199,12 +201,13 @@ def _put(prisms: Prisms, index: Array, prism: Prisms, stands: Bool[Array, ""]) -
     return jax.tree.map(lambda all, one: jnp.where(stands, all.at[index].set(one[0]), all), prisms, prism)
 
 
-def textured(arena: Arena, key: Array | None = None) -> Arena:
-    """Draw textures for everything in a room: busy obstacles and walls, a floor between nearly plain and busy.
+def textured(arena: Arena, key: Array | None = None, floor: float = INDOORS) -> Arena:
+    """Draw textures for everything in a room: busy obstacles and walls, a floor of contrast 0.05 to `floor`.
 
     The LGMD takes nearness from how much moves, so it is told apart from contrast only where things are about equally
     busy. A floor moves in both eyes alike: it raises u, and hardly touches the difference of the two; but a controller
-    that has met plain floors only takes a lawn for a wall on either side.
+    that has met plain floors only takes a lawn for a wall on either side. So the random rooms, in which it learns, have
+    floors of all kinds, the paper's have those of a laboratory.
     """
     boxes, cylinders = arena.boxes, arena.cylinders
     first, second = boxes.yaw.size, boxes.yaw.size + cylinders.yaw.size
@@ -220,7 +223,7 @@ def textured(arena: Arena, key: Array | None = None) -> Arena:
         boxes=dataclasses.replace(boxes, texture=things[:first]),
         cylinders=dataclasses.replace(cylinders, texture=things[first:]),
         wall_texture=between(draws[second:-2], (120.0, 0.5, 0.0, 0.3), (170.0, 0.7, 2.0 * jnp.pi, 0.6)),
-        floor_texture=between(draws[-2], (110.0, 0.05, 0.0, 0.2), (150.0, 0.5, 2.0 * jnp.pi, 0.5)),
+        floor_texture=between(draws[-2], (110.0, 0.05, 0.0, 0.2), (150.0, floor, 2.0 * jnp.pi, 0.5)),
         sky=200.0 + 50.0 * draws[-1, 0],
     )
 

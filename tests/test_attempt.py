@@ -1,7 +1,6 @@
 """`lgmdjax trial`: the robot that comes with the package, in one of the paper's experiments, as a user starts it."""
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,10 +19,9 @@ SEEDS = 2
 
 
 def trial(*arguments: str) -> subprocess.CompletedProcess:
-    """Run `lgmdjax trial` as its own process, in single precision and with the compiler that users have."""
+    """Run `lgmdjax trial` as its own process, in single precision as users do."""
     words = [sys.executable, "-m", "lgmdjax.cli", "trial", *arguments]
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    return subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")

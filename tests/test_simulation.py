@@ -178,7 +178,8 @@ def test_crowds_are_dealt_out_and_no_robot_is_alone_on_a_device(robots, shares):
 @pytest.mark.parametrize("robots", [1, 3, 4, 5])
 def test_a_crowd_that_does_not_come_out_even_is_filled_up_and_cut(robots):
     numbers, keys = jnp.arange(robots), jax.random.split(jax.random.key(0), robots)
-    dealt = jax.jit(lambda *batches: rollout.deal(lambda n, key: (n**2, jax.random.uniform(key)), *batches))
+    work = lambda n, keys: (n**2, jax.vmap(jax.random.uniform)(keys))  # noqa: E731
+    dealt = jax.jit(lambda *batches: rollout.deal(work, *batches))
     squares, luck = dealt(numbers, keys)
     np.testing.assert_array_equal(squares, np.arange(robots) ** 2)
     np.testing.assert_array_equal(luck, jax.vmap(jax.random.uniform)(keys))
