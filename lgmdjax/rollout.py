@@ -79,7 +79,7 @@ def march(
     """Scan `step(room, state, row)` of one robot over frames, mapped over robots; gives the last states and what came.
 
     `series` and what comes out have axes (robot, frame). A `vmap` of a `lax.scan` gives the same, but JAX traces the
-    body of the loop some more times then, to find out what differs between robots: for a walk twice as long in all.
+    body of the loop some more times then, to find out what differs between robots: for a walk a third longer in all.
     """
 
     def frame(states: Any, rows: Any) -> tuple[Any, Any]:
