@@ -1,6 +1,6 @@
 """What do the equations do that cannot work as printed?
 
-`python experiments/printed.py --help`; 10 minutes on two cores.
+`python experiments/printed.py --help`.
 """
 
 import sys

@@ -1,6 +1,6 @@
 """How far may eyes, room, legs and data be from those that were chosen?
 
-`python experiments/sensitivity.py --help`; an hour on two cores.
+`python experiments/sensitivity.py --help`.
 
 Pupils of less data learn from the walks of a run: name one that is trained, `--run runs/quick-0`.
 """

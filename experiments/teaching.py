@@ -1,6 +1,6 @@
 """Sec. 3.4 and 4.2: which rule should teach, and what should learn?
 
-`python experiments/teaching.py --help`; an hour on two cores.
+`python experiments/teaching.py --help`.
 """
 
 import sys

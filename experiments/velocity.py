@@ -1,6 +1,6 @@
 """Fig. 9: how fast should the robot walk for its eyes?
 
-`python experiments/velocity.py --help`; 6 minutes on two cores.
+`python experiments/velocity.py --help`.
 """
 
 import sys

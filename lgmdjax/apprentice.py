@@ -69,7 +69,7 @@ def _round(
             training.Settings(epochs=settings.round_epochs),
             checkpoints=folder / "checkpoints" / f"round-{number}",
         )
-        pupil = crew.taught(robot, training.enliven(fit.best, test))
+        pupil = crew.manned(robot, training.enliven(fit.best, test))
         facts = {"settings": asdict(settings), "round": number, "robot": crew.digest(pupil)}
         how = {"seed": seed, "facts": facts, "label": f"practice {number + 1} of {settings.rounds}"}
         rooms = crew.rooms_of(seed, OWN_WALKS + number, settings.robots)

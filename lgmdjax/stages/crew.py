@@ -96,11 +96,11 @@ def everyone(
 REPLAY = 4096  # commands of the random driver; a static number, so that one compiled program serves all stages
 
 
-def taught(params: simulation.Params, learned: navigator.Params) -> simulation.Params:
-    """Give a robot another navigator."""
+def manned(params: simulation.Params, driver: Any) -> simulation.Params:
+    """Exchange one of a robot's five drivers, the one whose parameters are of the same type."""
     crew = params.controller.driver
-    others = (learned if isinstance(one, navigator.Params) else one for one in crew.drivers)
-    return replace(params, controller=replace(params.controller, driver=replace(crew, drivers=tuple(others))))
+    five = tuple(driver if isinstance(one, type(driver)) else one for one in crew.drivers)
+    return replace(params, controller=replace(params.controller, driver=replace(crew, drivers=five)))
 
 
 def rooms_of(seed: int, episode: int, robots: int) -> simulation.Room:

@@ -69,7 +69,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity,
     for axis, value, walks in lessons(recorded, seed):
         for start in range(settings.seeds):
             place = folder / "pupils" / f"{axis}-{value:g}-{start}"
-            pupil = crew.taught(robot, _fit(place, walks, settings.epochs, seed + start))
+            pupil = crew.manned(robot, _fit(place, walks, settings.epochs, seed + start))
             rows.append(_score(folder, pupil, settings.bench, seed, axis, value, start=start))
     rows = [row | {"chosen": row["value"] == chosen.get(row["axis"])} for row in rows]
     files.write_json(folder / "sensitivity.json", rows)

@@ -84,10 +84,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Teaching, se
 def under(robot: simulation.Params, rule: str) -> simulation.Params:
     """Put a robot under a rule, which labels its walks and drives when the teacher does."""
     params = jax.tree.map(lambda value: jnp.asarray(value, float), RULES[rule])
-    crew_ = robot.controller.driver
-    others = (params if isinstance(one, braitenberg.Params) else one for one in crew_.drivers)
-    driver = replace(crew_, drivers=tuple(others))
-    return replace(robot, teacher=params, controller=replace(robot.controller, driver=driver))
+    return crew.manned(replace(robot, teacher=params), params)
 
 
 def teach(
@@ -103,7 +100,7 @@ def teach(
     train, test, _ = apprentice.split(episodes.stretches(walks), seed)
     start, epochs = navigator.create(jax.random.key(seed), variant), training.Settings(epochs=school.epochs)
     fit = training.fit(start, train, test, epochs, checkpoints=folder / "checkpoints" / "last")
-    return crew.taught(robot, training.enliven(fit.best, test))
+    return crew.manned(robot, training.enliven(fit.best, test))
 
 
 def _score(

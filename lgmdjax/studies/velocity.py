@@ -11,7 +11,7 @@ Source: Cizek & Faigl, sec. 4.2 and fig. 9.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +59,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Velocity, se
 
 def at_velocity(robot: simulation.Params, velocity: float) -> simulation.Params:
     """Have the blind driver walk straight on at a velocity."""
-    anyone = robot.controller.driver
-    blind = drivers.Blind(velocity=jnp.full(2, velocity, dtype=float))
-    seats = tuple(blind if isinstance(own, drivers.Blind) else own for own in anyone.drivers)
-    return replace(robot, controller=replace(robot.controller, driver=replace(anyone, drivers=seats)))
+    return crew.manned(robot, drivers.Blind(velocity=jnp.full(2, velocity, dtype=float)))
 
 
 def measure(velocity: float, record: simulation.Record, suppression: float) -> Row:
