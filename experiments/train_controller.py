@@ -23,7 +23,7 @@ SETTINGS = {
     "fit-gait": PAPER["fit-gait"],
     "collect": scales.Collect(eyes=EYES, robots=16, episodes=2, seconds=28.125, calibration_seconds=20),
     "train": scales.Train(
-        eyes=EYES, epochs=100, rounds=8, round_epochs=60, robots=16, round_seconds=120, variants=("lstm",)
+        eyes=EYES, epochs=100, rounds=8, round_epochs=60, robots=32, round_seconds=120, variants=("lstm",)
     ),
 }
 FILES = ("controller.safetensors", "baselines.npz")

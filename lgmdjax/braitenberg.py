@@ -54,8 +54,8 @@ class Params:
     gain_3b: Scalar = 0.6  # k_3b
     slowest: Scalar = SLOWEST  # the gait's range
     fastest: Scalar = FASTEST
-    near: Scalar = 0.8  # m; nearer than this, it turns at least a part of full_turn
-    close: Scalar = 0.5  # m; nearer than this, at least all of it
+    near: Scalar = 0.95  # m; nearer than this, it turns at least a part of full_turn
+    close: Scalar = 0.6  # m; nearer than this, at least all of it
     full_turn: Scalar = 3.0  # |v_right - v_left|; the range's width is the most there is
     symmetry: Scalar = 0.3  # |1/d_r - 1/d_l| / (1/d_r + 1/d_l) that still counts as a tie
     steady: Scalar = 0.3  # |v_right - v_left| up to which the robot counts as not turning

@@ -20,13 +20,21 @@ data and are not trained; they let the network work around zero, as the paper's 
 | `mean`            | the mean of the training velocities, whatever the eyes say                          |
 
 The outputs are linear, so they can leave the range of the gait; `braitenberg.limit` brings them back.
+
+A `symmetric` navigator looks at the world and, with a memory of its own, at its mirror image, and does the mean of
+what it would do in the one and, mirrored back, in the other:
+
+    f_sym(u) = (f(u) + M f(M u)) / 2,  M (left, right) = (right, left),
+
+so that a mirrored room gives the mirrored walk, exactly. A fitted network is symmetric only by chance: far off from
+everything ours leant to one side, and the mean of both has a tenth less error.
 """
 
 import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -44,7 +52,7 @@ from lgmdjax.errors import InputError
 Variant = Literal["lstm", "lstm-efference", "feed-forward", "mean"]
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 UNITS = 32
-FORMAT, VERSION = "lgmdjax navigator", "1"
+FORMAT, VERSION = "lgmdjax navigator", "2"
 SCALES = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 
@@ -59,14 +67,15 @@ class Params:
     output_scale: Float[Array, "2"]
     variant: Variant = struct.field(pytree_node=False, default="lstm")
     units: int = struct.field(pytree_node=False, default=UNITS)
+    symmetric: bool = struct.field(pytree_node=False, default=False)  # shown the mirror image too
 
 
 @struct.dataclass(kw_only=True)
 class State:
     """What the network remembers (s of eq. 17) and the last velocity; variants without memory carry zeros."""
 
-    hidden: Float[Array, "units"]
-    cell: Float[Array, "units"]
+    hidden: Float[Array, "views units"]  # of the world, and of its mirror image if that is shown
+    cell: Float[Array, "views units"]
     velocity: Float[Array, "2"]
 
 
@@ -89,7 +98,7 @@ class _FeedForward(nnx.Module):
         return carry, self.head(jnp.tanh(self.layer(inputs)))
 
 
-def create(key: Array, variant: Variant = "lstm", units: int = UNITS) -> Params:
+def create(key: Array, variant: Variant = "lstm", units: int = UNITS, *, symmetric: bool = False) -> Params:
     """Draw an untrained navigator as Keras does: Glorot inputs, orthogonal recurrence, forget bias 1."""
     if variant not in VARIANTS:
         raise InputError(f"navigator variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
@@ -104,13 +113,15 @@ def create(key: Array, variant: Variant = "lstm", units: int = UNITS) -> Params:
         output_scale=ones,
         variant=variant,
         units=units,
+        symmetric=symmetric,
     )
 
 
 def init(params: Params) -> State:
     """Start with nothing remembered, and the mean velocity as the last one."""
-    nothing = jnp.zeros(params.units, params.output_mean.dtype)
-    return State(hidden=nothing, cell=nothing, velocity=params.output_mean)
+    nothing = jnp.zeros((2 if params.symmetric else 1, params.units), params.output_mean.dtype)
+    velocity = jnp.mean(_mirrored(params, params.output_mean), axis=0)
+    return State(hidden=nothing, cell=nothing, velocity=velocity)
 
 
 def step(params: Params, state: State, u: Float[Array, "2"]) -> tuple[State, Float[Array, "2"]]:
@@ -119,15 +130,10 @@ def step(params: Params, state: State, u: Float[Array, "2"]) -> tuple[State, Flo
     A caller that drives with another velocity than the one returned (limited, or somebody else's) puts it
     into the state's `velocity`, which `lstm-efference` sees next.
     """
-    if params.variant == "mean":
-        return replace(state, velocity=params.output_mean), params.output_mean
-    inputs = (u - params.input_mean) / params.input_scale
-    if params.variant == "lstm-efference":
-        last = (state.velocity - params.output_mean) / params.output_scale
-        inputs = jnp.concatenate([inputs, last])
-    network = nnx.merge(_graph(params.variant, params.units), params.weights)
-    (cell, hidden), output = network((state.cell, state.hidden), inputs)
-    velocity = params.output_mean + params.output_scale * output
+    views = jax.vmap(partial(_look, params))
+    (cell, hidden), answers = views((state.cell, state.hidden), _mirrored(params, u), _mirrored(params, state.velocity))
+    # The answer to the mirror image, the second if there is one, is mirrored back.
+    velocity = jnp.mean(answers.at[1:].set(answers[1:, ::-1]), axis=0)
     return State(hidden=hidden, cell=cell, velocity=velocity), velocity
 
 
@@ -141,14 +147,15 @@ def save(path: Path | str, params: Params, metadata: Mapping[str, Any] | None = 
     tensors = {name: np.asarray(value) for name, value in _tensors(params).items()}
     if not all(np.isfinite(value).all() for value in tensors.values()):
         raise InputError(f"{path}: expected finite weights to save, got some that are not; train again")
-    header = {"variant": params.variant, "units": params.units, "versions": versions.installed(), **(metadata or {})}
+    structure = {"variant": params.variant, "units": params.units, "symmetric": params.symmetric}
+    header = {**structure, "versions": versions.installed(), **(metadata or {})}
     text = {"format": FORMAT, "version": VERSION} | {name: json.dumps(x) for name, x in header.items()}
-    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
+    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        save_file(tensors, partial, text)
-        partial.replace(path)
+        save_file(tensors, unfinished, text)
+        unfinished.replace(path)
     except (OSError, SafetensorError) as error:
-        partial.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
         raise InputError(f"{path}: expected a place to write to, got {error}; choose another") from error
 
 
@@ -164,7 +171,8 @@ def load(path: Path | str) -> tuple[Params, dict[str, Any]]:
                 raise InputError(f"{path}: expected version {VERSION}, got {header.get('version')}; {again}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         metadata = {name: json.loads(text) for name, text in header.items() if name not in ("format", "version")}
-        template = jax.eval_shape(lambda: create(jax.random.key(0), metadata["variant"], metadata["units"]))
+        structure = (metadata["variant"], metadata["units"])
+        template = jax.eval_shape(lambda: create(jax.random.key(0), *structure, symmetric=metadata["symmetric"]))
     except (OSError, SafetensorError, json.JSONDecodeError, KeyError) as error:
         raise InputError(f"{path}: expected a safetensors file of a navigator, got {error}; {again}") from error
     expected = {name: value.shape for name, value in _tensors(template).items()}
@@ -174,6 +182,25 @@ def load(path: Path | str) -> tuple[Params, dict[str, Any]]:
     if not all(np.isfinite(value).all() for value in tensors.values()):
         raise InputError(f"{path}: expected finite weights, got some that are not; {again}")
     return _with_tensors(template, tensors), metadata
+
+
+def _mirrored(params: Params, sides: Float[Array, "2"]) -> Float[Array, "views 2"]:
+    """Put something of both sides and its mirror image together, or alone."""
+    return jnp.stack([sides, sides[::-1]] if params.symmetric else [sides])
+
+
+def _look(
+    params: Params, memory: tuple[Array, Array], u: Float[Array, "2"], last: Float[Array, "2"]
+) -> tuple[tuple[Array, Array], Float[Array, "2"]]:
+    """Answer to one view of the world."""
+    if params.variant == "mean":
+        return memory, params.output_mean
+    inputs = (u - params.input_mean) / params.input_scale
+    if params.variant == "lstm-efference":
+        inputs = jnp.concatenate([inputs, (last - params.output_mean) / params.output_scale])
+    network = nnx.merge(_graph(params.variant, params.units), params.weights)
+    memory, output = network(memory, inputs)
+    return memory, params.output_mean + params.output_scale * output
 
 
 @lru_cache
@@ -210,4 +237,4 @@ def _with_tensors(params: Params, tensors: Mapping[str, np.ndarray]) -> Params:
     arrays = {name: jnp.asarray(value, dtype=float) for name, value in tensors.items()}
     scales = {name: arrays.pop(name) for name in SCALES}
     weights = traverse_util.unflatten_dict(arrays, sep=".").get("weights", {})
-    return Params(weights=weights, variant=params.variant, units=params.units, **scales)
+    return replace(params, weights=weights, **scales)

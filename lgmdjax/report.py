@@ -31,12 +31,18 @@ from lgmdjax import arena, camera, collisions, figures, film, hexapod, scenes, t
 from lgmdjax.errors import InputError
 from lgmdjax.files import read_arrays, read_json
 from lgmdjax.gait import Gait
-from lgmdjax.studies import printed, sensitivity, teaching, velocity
+from lgmdjax.studies import failures, printed, sensitivity, teaching, velocity
 
 MINUS = "\N{MINUS SIGN}"
 NOMINAL = float(Gait().nominal_velocity)  # m/s, the speed at v = 1
 STAGES = ("fit-gait", "collect", "train", "evaluate")  # the folders of their files, and the commands that make them
-STUDIES = {"velocity": velocity, "teaching": teaching, "printed": printed, "sensitivity": sensitivity}
+STUDIES = {
+    "velocity": velocity,
+    "teaching": teaching,
+    "printed": printed,
+    "failures": failures,
+    "sensitivity": sensitivity,
+}
 PLACES = {name: trial.title for name, trial in trials.TRIALS.items()}
 LOOKS_AT = {
     "teacher": "laser scanner",

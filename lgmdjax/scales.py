@@ -112,6 +112,13 @@ class Printed:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Failures:
+    """Robots before white walls and in corners."""
+
+    bench: Bench
+
+
+@dataclass(frozen=True, kw_only=True)
 class Sensitivity:
     """The robot with one thing changed at a time, and pupils of less data, from `seeds` starts each."""
 
@@ -186,6 +193,7 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
             seeds=3,
         ),
         "printed": Printed(bench=Bench(eyes=_QUICK, robots=16, seconds=60)),
+        "failures": Failures(bench=Bench(eyes=_QUICK, robots=16, seconds=50)),
         "sensitivity": Sensitivity(bench=Bench(eyes=_QUICK, robots=16, seconds=60), epochs=60, seeds=2),
         "report": Report(video_seconds=30),
     },

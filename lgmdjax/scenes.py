@@ -175,7 +175,7 @@ def _random_box(draws: Array, arena: Arena, gap: float) -> tuple[Prisms, Bool[Ar
 def _random_cylinder(draws: Array, arena: Arena, gap: float) -> tuple[Prisms, Bool[Array, ""]]:
     """Make a cylinder and find a place for it; is there one?"""
     thickness, rise = draws[:2]
-    radius = 0.08 + 0.22 * thickness
+    radius = 0.05 + 0.25 * thickness
     centre, fits = _find_place(draws[4:], arena, jnp.zeros((1, 2), dtype=float), radius, gap)
     return place(centre, radius, 0.5 + rise, count=1), fits
 

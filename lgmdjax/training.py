@@ -13,7 +13,8 @@ goes on into the next window, without its gradient, and starts anew where a stre
 
 Source: Cizek & Faigl, sec. 3.4, 4.2 and 5.1: RMSprop, mean squared error, 1000 epochs, data split in half.
 Windows and streams are ours, and so is `mirrored`: the two hemifields are mirror images, so every walk is
-also a walk in the mirrored room, with left and right exchanged.
+also a walk in the mirrored room, with left and right exchanged, and what is fitted is made `symmetric`. Fitted as it
+is, not as the mean of both, it has less to fit the walks by heart with: r = 0.65 in place of 0.61 in unseen rooms.
 """
 
 import hashlib
@@ -117,7 +118,7 @@ def fit(
         show: show a progress bar.
     """
     settings = _checked(settings or Settings(), train, test)
-    params = standardise(params, train, settings.mirrored)
+    params = replace(standardise(params, train, settings.mirrored), symmetric=False)
     tapes = _tape(params, train, settings), _tape(params, test, settings)
     progress = _start(params, settings)
     if checkpoints is None:
@@ -125,9 +126,10 @@ def fit(
     else:
         with closing(Checkpoints(checkpoints, _identity(progress, tapes, settings))) as saved:
             progress = _finish(params, saved.latest(progress), tapes, settings, saved, show)
+    fitted = replace(params, symmetric=settings.mirrored)
     return Fit(
-        params=replace(params, weights=progress.weights),
-        best=replace(params, weights=progress.best),
+        params=replace(fitted, weights=progress.weights),
+        best=replace(fitted, weights=progress.best),
         train=np.asarray(progress.train),
         test=np.asarray(progress.test),
     )
@@ -253,7 +255,7 @@ def _window_error(
     def frame(states: navigator.State, now: Tape) -> tuple[navigator.State, Array]:
         if told:
             states = replace(states, velocity=now.last)
-        states = jax.tree.map(lambda old, new: jnp.where(now.fresh[:, None], new, old), states, start)
+        states = jax.vmap(lambda fresh, *both: jax.tree.map(partial(jnp.where, fresh), *both))(now.fresh, start, states)
         states, velocity = jax.vmap(navigator.step, in_axes=(None, 0, 0))(params, states, now.u)
         return states, jnp.sum(now.counts[:, None] * (velocity - now.label) ** 2)
 

@@ -101,6 +101,12 @@ def rows_of(study: str) -> list[dict]:
         stuck = {"per_100_m": asdict(scores.poisson_rate(0, 0.001)), "distance": 0.1, "collisions": 0}
         row = {"case": "eq. 15", "speed": 0.05, "u": {"score": 0.7, "left": 0.5, "right": 0.6}}
         return [row | {"teacher": rate, "learned": rate}, row | {"case": "eq. 1", "teacher": stuck, "learned": stuck}]
+    if study == "failures":
+        away = {"avoided": asdict(scores.wilson(9, 12)), "untouched": 9, "robots": 12, "retreated": 2}
+        walls = [{"place": "white", "contrast": c, "driver": "learned"} | away for c in (0.0, 0.5)]
+        others = [{"place": "white", "contrast": 0.0, "driver": "teacher"} | away]
+        corners = [{"place": "corner", "contrast": None, "driver": name} | away for name in ("learned", "eq. 22")]
+        return walls + others + corners
     axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | rate for v in (0.5, 1.0)]
     return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | rate for k in range(2)]
 
@@ -109,7 +115,7 @@ def write_experiments(run: Path) -> Path:
     """Add to a run folder what `--scale paper` has beside: a trial that ends, and the studies."""
     facts = json.loads((run / "run.json").read_text())
     facts["settings"]["evaluate"]["places"].append({"trial": "tube", "eyes": {"width": 320, "height": 240}})
-    for study in ("velocity", "teaching", "printed", "sensitivity"):
+    for study in ("velocity", "teaching", "printed", "failures", "sensitivity"):
         facts["settings"][study] = {"bench": {"robots": 16}}
         (run / study).mkdir()
         (run / study / "done.json").write_bytes((run / "train" / "done.json").read_bytes())

@@ -13,6 +13,7 @@ from synthetic import walk
 
 from lgmdjax import episodes, hexapod, rollout, scores, simulation
 from lgmdjax.stages import crew
+from lgmdjax.studies import alone
 
 ROOT = Path(__file__).parent.parent
 SEEDS = 2
@@ -59,6 +60,15 @@ def test_is_done_once_and_refuses_other_settings(out):
     other = trial("indoor", "--seeds", "3", "--out", str(out))
     assert other.returncode == 2
     assert "seeds = 3" in other.stderr and other.stderr.count("\n") == 1
+
+
+@pytest.mark.usefixtures("float32")
+def test_drivers_are_compared_in_a_line_each(out, capsys):
+    """The walk that is there already is taken as it is."""
+    alone.walked_by(("indoor",), ("learned",), seeds=SEEDS, out=out)
+    assert f"indoor, learned: {SEEDS} of {SEEDS} untouched" in capsys.readouterr().out
+    scored = {"collisions": 3, "distance": 41.2, "per_100_m": {}}
+    assert alone.told(scored) == "3 collisions in 41 m"
 
 
 @pytest.mark.parametrize(

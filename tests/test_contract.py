@@ -122,6 +122,13 @@ COMPONENTS = (
         )
         for variant in navigator.VARIANTS
     ),
+    Component(
+        "navigator-symmetric",
+        lambda: navigator.create(jax.random.key(1), symmetric=True),
+        lambda params, _: navigator.init(params),
+        navigator.step,
+        between(0.5, 1.0, 2),
+    ),
     driven(drivers.BLIND, lambda: drivers.Blind(velocity=jnp.asarray([1.2, 1.1]))),
     driven(
         drivers.DIRECT,

@@ -81,14 +81,27 @@ def test_efference_copy_is_the_last_velocity():
         assert np.any(np.abs(other - velocity) > 1e-9) == hears
 
 
+@pytest.mark.parametrize("variant", navigator.VARIANTS)
+def test_a_symmetric_navigator_walks_the_mirrored_walk_in_the_mirrored_world(variant, precision):
+    """It is the mean of what the same network does in the world and, mirrored back, in its mirror image."""
+    u, alone = jnp.asarray(U, dtype=float), scaled(variant)
+    both = replace(alone, symmetric=True)
+    np.testing.assert_array_equal(drive(both, u[:, ::-1]), drive(both, u)[:, ::-1])
+    if variant == "lstm-efference":  # hears its own last velocity, which is the mean's
+        return
+    expected = (np.asarray(drive(alone, u)) + np.asarray(drive(alone, u[:, ::-1]))[:, ::-1]) / 2
+    np.testing.assert_allclose(drive(both, u), expected, rtol=1e-12 if precision == "float64" else 1e-5)
+
+
 def test_the_mean_is_the_mean():
     params = scaled("mean")
     np.testing.assert_array_equal(drive(params, jnp.asarray(U)), np.tile(params.output_mean, (40, 1)))
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("variant", navigator.VARIANTS)
-def test_a_saved_navigator_is_the_same(tmp_path, variant, precision):
-    params, path = scaled(variant), tmp_path / "controller.safetensors"
+def test_a_saved_navigator_is_the_same(tmp_path, variant, symmetric, precision):
+    params, path = scaled(variant, symmetric=symmetric), tmp_path / "controller.safetensors"
     told = {"calibration": {"threshold": 4.5}, "camera": {"width": 320, "height": 240}}
     navigator.save(path, params, told)
     loaded, metadata = navigator.load(path)

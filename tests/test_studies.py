@@ -1,5 +1,6 @@
 """The studies: what they change, what they count, and their figures, on walks and rows made up."""
 
+import json
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,9 +12,9 @@ import pytest
 import synthetic
 from scipy.spatial.transform import Rotation
 
-from lgmdjax import braitenberg, calibration, episodes, figures, hexapod, scales, scores, simulation
+from lgmdjax import braitenberg, calibration, episodes, figures, hexapod, scales, scores, simulation, trials
 from lgmdjax.stages import STUDIES, crew
-from lgmdjax.studies import printed, sensitivity, teaching, velocity
+from lgmdjax.studies import alone, failures, printed, sensitivity, teaching, velocity
 
 EYES = scales.Eyes(width=80, height=60, pooling=3)
 
@@ -88,6 +89,15 @@ def test_an_erratum_changes_one_thing(robot):
     assert printed.CASES["eqs. 1, 3: sign of w_fe"](robot, Path()).controller.cpg.printed_sign
 
 
+def test_walls_are_papered_and_nothing_else():
+    rooms = trials.draw_rooms("white", 3, 0)
+    after = failures.papered(rooms, 0.25)
+    np.testing.assert_array_equal(after.arena.wall_texture[..., 1], 0.25)
+    back = replace(after, arena=replace(after.arena, wall_texture=rooms.arena.wall_texture))
+    jax.tree.map(np.testing.assert_array_equal, back.arena, rooms.arena)
+    assert not np.any(rooms.arena.wall_texture[..., 1])
+
+
 def test_every_axis_of_sensitivity_has_the_chosen_value_once(robot):
     chosen = sensitivity.settled(EYES)
     values: dict[str, list[float]] = {}
@@ -148,7 +158,21 @@ def test_follow_agrees_with_correlation_of_what_was_recorded():
     assert 0.8 < found["left"] < found["score"]
 
 
-@pytest.mark.parametrize("study", [velocity, teaching, printed, sensitivity], ids=lambda study: study.__name__)
+def test_a_study_can_be_started_alone(tmp_path, monkeypatch):
+    """With walks made up: a few centimetres straight on, where nobody turns back and nobody touches anything."""
+    monkeypatch.setattr(crew, "walked", lambda folder, params, rooms, *_, **__: synthetic.walk(len(rooms.starts), 60))
+    bench = scales.Bench(eyes=EYES, robots=2, seconds=2.0)
+    alone.command("failures")(scales.Failures(bench=bench), out=tmp_path)
+    folder = tmp_path / "failures-0" / "failures"
+    rows = json.loads((folder / "failures.json").read_text())
+    assert len({(row["place"], row["contrast"], row["driver"]) for row in rows}) == len(rows) == 13
+    assert all((row["robots"], row["untouched"], row["retreated"]) == (2, 2, 0) for row in rows)
+    assert (folder / "failures.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "study", [velocity, teaching, printed, failures, sensitivity], ids=lambda study: study.__name__
+)
 def test_figures_can_be_drawn(study):
     rows = synthetic.rows_of(study.__name__.rpartition(".")[2])
     figure = study.draw(rows)

@@ -260,6 +260,18 @@ def test_mirrored_data_teach_both_sides_alike(data):
     np.testing.assert_allclose(lonely.output_mean, np.concatenate([w.label for w in data[0]]).mean(0))
 
 
+def test_what_mirrored_data_teach_is_made_symmetric(data):
+    """And has less error for it than the network that was fitted, in a room that it has not seen."""
+    train, test, unseen = data
+    fitted = training.fit(
+        navigator.create(jax.random.key(0)), train[:2], test[:2], settings(mirrored=True), show=False
+    ).best
+    assert fitted.symmetric
+    assert training.score(fitted, unseen)["mse"] < training.score(replace(fitted, symmetric=False), unseen)["mse"]
+    alone = training.fit(navigator.create(jax.random.key(0)), train[:2], test[:2], settings(epochs=1), show=False)
+    assert not alone.best.symmetric
+
+
 def test_an_efference_copy_of_what_was_told(data):
     """`told` feeds the recorded velocity: nearly the next label, so training errs far less."""
     train, test, _ = data

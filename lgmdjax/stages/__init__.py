@@ -27,7 +27,7 @@ def _later(module: str) -> Work:
 _BEFORE = ("fit-gait", "collect", "train")
 STUDIES = tuple(
     Stage(name=name, work=_later(f"studies.{name}"), inputs=_BEFORE)
-    for name in ("velocity", "teaching", "printed", "sensitivity")
+    for name in ("velocity", "teaching", "printed", "failures", "sensitivity")
 )
 STAGES = (
     Stage(name="fit-gait", work=_later("stages.fit_gait")),

@@ -1,14 +1,15 @@
-"""A study by itself, as the scripts in `experiments/` start it: with the robot that comes along, or with a run's."""
+"""An experiment by itself, as the scripts in `experiments/` start it: with the robot that comes along, or a run's."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import tyro
 
-from lgmdjax import figures, files, scales
+from lgmdjax import attempt, figures, files, scales
 from lgmdjax.runs import Stage, execute, open_run
 from lgmdjax.stages import crew
 
@@ -45,6 +46,45 @@ def command(study: str) -> Callable[..., None]:
     main.__doc__ = f"{cleandoc(module.__doc__ or '')}\n\n{cleandoc(ARGUMENTS)}"
     main.__annotations__["settings"] = type(default)
     return main
+
+
+def compare(*trials: str) -> None:
+    """Read the flags of `walked_by` from the command line, and do it."""
+    tyro.cli(partial(walked_by, trials))
+
+
+def walked_by(
+    trials: tyro.conf.Suppress[tuple[str, ...]],
+    who: tuple[attempt.Who, ...] = get_args(attempt.Who),
+    *,
+    seed: int = 0,
+    seeds: int | None = None,
+    width: int | None = None,
+    run: Path | None = None,
+    out: Path = Path("runs/trials"),
+) -> None:
+    """Let several drivers walk experiments of the paper's, as `lgmdjax trial` does one, and print what came of each.
+
+    Args:
+        trials: names of the experiments
+        who: the drivers that walk
+        seed: of rooms, textures and starts
+        seeds: how many times; as many as the paper has, or more, if left out
+        width: of the pictures [px], 320 as in the paper; as the robot learned with if left out
+        run: folder of the run whose robot walks; the one that comes along if left out
+        out: the results go into a folder a trial and driver in here
+    """
+    for name in trials:
+        for driver in who:
+            folder = attempt.attempt(name, driver, seed=seed, seeds=seeds, width=width, run=run, out=out)
+            print(f"{name}, {driver}: {told(files.read_json(folder / 'outcome.json'))}; look into {folder}")
+
+
+def told(outcome: Mapping[str, Any]) -> str:
+    """Say in a line what came of a trial."""
+    if "per_100_m" in outcome:
+        return f"{outcome['collisions']} collisions in {outcome['distance']:.0f} m"
+    return f"{outcome['untouched']} of {outcome['robots']} untouched, {outcome['retreated']} of them turned back"
 
 
 def _inputs(run: Path | None) -> dict[str, Path]:

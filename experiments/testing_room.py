@@ -1,0 +1,15 @@
+"""Fig. 13: five walks in the testing room, all drivers compared.
+
+`python experiments/testing_room.py --help`.
+"""
+
+import sys
+
+from lgmdjax.cli import guarded, import_physics, prepare_jax
+
+if __name__ == "__main__":
+    prepare_jax()
+    import_physics()
+    from lgmdjax.studies import alone
+
+    sys.exit(guarded(lambda: alone.compare("testing")))
