@@ -8,23 +8,19 @@ carries on.
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import tyro
 
 from lgmdjax import scales
 from lgmdjax.cli import guarded, import_physics, prepare_jax
-from lgmdjax.runs import execute, open_run
-from lgmdjax.stages import STAGES, crew
 
-QUICK, PAPER = scales.SCALES["quick"], scales.SCALES["paper"]
-EYES = QUICK["collect"].eyes
+PAPER = scales.SCALES["paper"]
 SETTINGS = {
     "fit-gait": PAPER["fit-gait"],
-    "collect": scales.Collect(eyes=EYES, robots=16, episodes=2, seconds=28.125, calibration_seconds=20),
-    "train": scales.Train(
-        eyes=EYES, epochs=100, rounds=8, round_epochs=60, robots=32, round_seconds=120, variants=("lstm",)
-    ),
+    "collect": replace(PAPER["collect"], eyes=PAPER["train"].eyes, calibration_seconds=20),
+    "train": replace(PAPER["train"], variants=("lstm",), halves_epochs=80),
 }
 FILES = ("controller.safetensors", "baselines.npz")
 
@@ -36,8 +32,11 @@ def main(out: Path = Path("runs"), seed: int = 0) -> None:
         out: folder of the run folder
         seed: of everything that is drawn at random
     """
-    prepare_jax()
+    prepare_jax()  # before anything imports JAX
     import_physics()
+    from lgmdjax.runs import execute, open_run
+    from lgmdjax.stages import STAGES, crew
+
     train = execute(open_run(out, f"controller-{seed}", "controller", seed, SETTINGS), STAGES, "train")
     for name in FILES:
         shutil.copyfile(train / name, crew.DATA / name)

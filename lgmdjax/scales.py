@@ -25,12 +25,14 @@ class FitGait:
 class Eyes:
     """Pictures of width x height pixels an eye, of which each LGMD gets the part `overlap` on its side.
 
-    Its cells look at `pooling` pixels a side: about 6 degrees at every scale.
+    Its cells look at `pooling` pixels a side: about 6 degrees at every scale. The two share no column of the picture:
+    what both eyes see, which is what stands straight ahead, far off, tells neither side from the other
+    (`experiments/overlap.py`).
     """
 
     width: int
     height: int
-    overlap: float = 0.6
+    overlap: float = 0.5
     pooling: int = 1
 
 
@@ -171,7 +173,7 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "fit-gait": FitGait(steps=6000, seconds=20),
         "collect": Collect(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
         "train": Train(
-            eyes=_QUICK, epochs=100, rounds=8, round_epochs=60, robots=16, round_seconds=120, halves_epochs=1000
+            eyes=_QUICK, epochs=100, rounds=8, round_epochs=60, robots=32, round_seconds=120, halves_epochs=1000
         ),
         "evaluate": Evaluate(
             places=(
@@ -181,8 +183,8 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
                 Place(trial="indoor", eyes=_PAPER, seeds=12, drivers=_SOME),
                 Place(trial="outdoor", eyes=_PAPER, seeds=10, drivers=_SOME),
                 Place(trial="dynamic", eyes=_PAPER, seeds=10, drivers=_SOME),
-                Place(trial="white", eyes=_PAPER, seeds=12, drivers=_SOME),
-                Place(trial="corner", eyes=_PAPER, seeds=12, drivers=_SOME),
+                Place(trial="white", eyes=_QUICK, seeds=12, drivers=_SOME),
+                Place(trial="corner", eyes=_QUICK, seeds=12, drivers=_SOME),
             )
         ),
         "velocity": Velocity(bench=Bench(eyes=_SMALLER, robots=16, seconds=20)),

@@ -150,7 +150,7 @@ def test_a_missing_or_damaged_file_is_refused(good, tmp_path):
 
 def test_another_kind_of_file_or_version_is_refused(good):
     rewrite(good, {"version": "0"})
-    assert "version 1, got 0" in refused(good)
+    assert "version 2, got 0" in refused(good)
     rewrite(good, {"format": "something"})
     assert "another kind" in refused(good)
     save_file({"weights": np.zeros(3)}, good)

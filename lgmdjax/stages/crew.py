@@ -106,8 +106,8 @@ def manned(params: simulation.Params, driver: Any) -> simulation.Params:
 def rooms_of(seed: int, episode: int, robots: int) -> simulation.Room:
     """Draw the rooms of an episode to learn in, the same for the same seed and number, of every contrast.
 
-    A robot that has learned in busy rooms only hardly turns from the one thing that moves before a plain wall: where
-    little moves, little is much. Cylinders as thin as that thing were walked into half as often for it.
+    A robot that has learned in busy rooms only hardly turns from the one thing that moves before a plain wall. Where
+    little moves, little is much; it has to be met to be learned.
     """
     key = jax.random.fold_in(jax.random.key(seed), episode)
     rooms = rollout.random_rooms(key, robots)
