@@ -14,7 +14,8 @@ goes on into the next window, without its gradient, and starts anew where a stre
 Source: Cizek & Faigl, sec. 3.4, 4.2 and 5.1: RMSprop, mean squared error, 1000 epochs, data split in half.
 Windows and streams are ours, and so is `mirrored`: the two hemifields are mirror images, so every walk is
 also a walk in the mirrored room, with left and right exchanged, and what is fitted is made `symmetric`. Fitted as it
-is, not as the mean of both, it has less to fit the walks by heart with: r = 0.65 in place of 0.61 in unseen rooms.
+is, not as the mean of both, it has less to learn the walks by heart with: in rooms kept back its turns followed the
+labels with r = 0.68, in place of 0.61.
 """
 
 import hashlib

@@ -45,7 +45,7 @@ def main(
     records = [episodes.batched([walk for walk in walks if walk.episode == number][:robots]) for number in numbers]
     rooms = [crew.rooms_of(seed, number, settings["robots"]).arena for number in numbers]
     rooms = jax.tree.map(lambda leaf: leaf[:robots], rooms)
-    rows = [("overlap", *(f"episode {number}" for number in numbers), "tube")]
+    rows: list[tuple[str, ...]] = [("overlap", *(f"episode {number}" for number in numbers), "tube")]
     for overlap in overlaps:
         looking = crew.with_eyes(robot, scales.Eyes(**settings["eyes"] | {"overlap": overlap}))
         detector, eyes = looking.controller.lgmd, looking.camera
