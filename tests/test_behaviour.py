@@ -21,7 +21,7 @@ def beside(key: jax.Array, lateral: float) -> arena.Arena:
 
 
 SCENES = {
-    "box to the left": lambda key: beside(key, 0.2),
+    "box to the left": lambda key: beside(key, 0.35),  # in the way, and not on both sides of it
     "box far to the left": lambda key: beside(key, 0.9),
     "indoor": scenes.indoor_scene,
     "outdoor": scenes.outdoor_scene,
