@@ -26,7 +26,7 @@ what it would do in the one and, mirrored back, in the other:
 
     f_sym(u) = (f(u) + M f(M u)) / 2,  M (left, right) = (right, left),
 
-so that a mirrored room gives the mirrored walk, exactly. A fitted network is symmetric only by chance: far off from
+so that mirrored u give the mirrored commands, exactly. A fitted network is symmetric only by chance: far off from
 everything ours leant to one side; the mean of both has 5 to 9 % less squared error in rooms kept back.
 """
 

@@ -1,9 +1,9 @@
 """Where the paper's robot fails, and what helps: a wall without contrast, and a corner (sec. 5.4).
 
-A looming detector sees edges that spread. A plain wall has none but its rims, so no learning can help; contrast does,
-and here it is given back to the wall step by step. A corner is seen, by both eyes alike: which way to turn is then up
-to the driver, and eq. 22, for which both sides weigh the same, walks into it. What helps is to have turned already and
-to go on with it, as the teacher of this package does and as a network with a memory can learn to.
+A looming detector sees edges that spread. A plain wall has none but its rims, so nothing learned can help; here it is
+given contrast step by step. A corner is seen, by both eyes alike: which way to turn is then up to the driver. Eq. 22
+has nothing to choose by; the teacher of this package goes on turning the way it has begun to, and a network with a
+memory can learn that.
 
 Writes failures.json, a row a place, a contrast and a driver, and the walks.
 
