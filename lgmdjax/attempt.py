@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,7 +22,6 @@ from lgmdjax.stages import crew
 
 FILM = 15.0  # s
 ROOMS_DRAWN = 6
-Who = Literal["teacher", "learned", "blind", "direct", "random"]
 DRIVERS = {driver.name: driver for driver in drivers.ALL}
 
 

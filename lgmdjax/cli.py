@@ -33,8 +33,26 @@ class Pipeline:
     """name of the run folder; <scale>-<seed> if empty"""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Attempts:
+    """Flags of whoever walks experiments of the paper."""
+
+    seed: int = 0
+    """of rooms, textures and starts"""
+    seeds: int | None = None
+    """how many times; as many as the paper has, or more, if left out"""
+    width: int | None = None
+    """of the pictures [px], 320 as in the paper; as it learned with, which says nearly the same, if left out"""
+    run: Path | None = None
+    """folder of the run whose robot walks; the trained one that comes along if left out"""
+    out: Path = Path("runs/trials")
+    """the results go into a folder a trial and driver in here"""
+
+
 Name = Literal["testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "white", "corner"]
+Who = Literal["teacher", "learned", "blind", "direct", "random"]
 Flags = Annotated[Pipeline, tyro.conf.arg(name="")]
+AttemptFlags = Annotated[Attempts, tyro.conf.arg(name="")]
 
 
 def reproduce(pipeline: Flags) -> None:
@@ -120,28 +138,19 @@ def watch(
 def trial(
     name: Annotated[Name, tyro.conf.Positional],
     *,
-    driver: Literal["teacher", "learned", "blind", "direct", "random"] = "learned",
-    seed: int = 0,
-    seeds: int | None = None,
-    width: int | None = None,
-    run: Path | None = None,
-    out: Path = Path("runs/trials"),
+    driver: Who = "learned",
+    attempts: AttemptFlags,
 ) -> None:
     """Walk one of the paper's experiments; leave the outcome, the walks, a picture from above and a film.
 
     Args:
         name: of the experiment
         driver: who walks
-        seed: of rooms, textures and starts
-        seeds: how many times; as many as the paper has, or more, if left out
-        width: of its pictures [px], 320 as in the paper; as it learned with, which says nearly the same, if left out
-        run: folder of the run whose robot walks; the trained one that comes along if left out
-        out: the results go into a folder of the trial's name in here
     """
     import_physics()
     from lgmdjax.attempt import attempt
 
-    print(f"look into {attempt(name, driver, seed=seed, seeds=seeds, width=width, run=run, out=out)}")
+    print(f"look into {attempt(name, driver, **vars(attempts))}")
 
 
 COMMANDS: dict[str, Callable[..., int | None]] = {

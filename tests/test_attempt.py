@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from synthetic import walk
 
-from lgmdjax import episodes, hexapod, rollout, scores, simulation
+from lgmdjax import cli, episodes, hexapod, rollout, scores, simulation
 from lgmdjax.stages import crew
 from lgmdjax.studies import alone
 
@@ -65,7 +65,7 @@ def test_is_done_once_and_refuses_other_settings(out):
 @pytest.mark.usefixtures("float32")
 def test_drivers_are_compared_in_a_line_each(out, capsys):
     """The walk that is there already is taken as it is."""
-    alone.walked_by(("indoor",), ("learned",), seeds=SEEDS, out=out)
+    alone.walked_by(("indoor",), cli.Attempts(seeds=SEEDS, out=out), ("learned",))
     assert f"indoor, learned: {SEEDS} of {SEEDS} untouched" in capsys.readouterr().out
     scored = {"collisions": 3, "distance": 41.2, "per_100_m": {}}
     assert alone.told(scored) == "3 collisions in 41 m"

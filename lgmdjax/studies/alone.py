@@ -10,6 +10,7 @@ from typing import Any, get_args
 import tyro
 
 from lgmdjax import attempt, figures, files, scales
+from lgmdjax.cli import AttemptFlags, Who
 from lgmdjax.runs import Stage, execute, open_run
 from lgmdjax.stages import crew
 
@@ -54,29 +55,17 @@ def compare(*trials: str) -> None:
 
 
 def walked_by(
-    trials: tyro.conf.Suppress[tuple[str, ...]],
-    who: tuple[attempt.Who, ...] = get_args(attempt.Who),
-    *,
-    seed: int = 0,
-    seeds: int | None = None,
-    width: int | None = None,
-    run: Path | None = None,
-    out: Path = Path("runs/trials"),
+    trials: tyro.conf.Suppress[tuple[str, ...]], attempts: AttemptFlags, who: tuple[Who, ...] = get_args(Who)
 ) -> None:
     """Let several drivers walk experiments of the paper's, as `lgmdjax trial` does one, and print what came of each.
 
     Args:
         trials: names of the experiments
         who: the drivers that walk
-        seed: of rooms, textures and starts
-        seeds: how many times; as many as the paper has, or more, if left out
-        width: of the pictures [px], 320 as in the paper; as the robot learned with if left out
-        run: folder of the run whose robot walks; the one that comes along if left out
-        out: the results go into a folder a trial and driver in here
     """
     for name in trials:
         for driver in who:
-            folder = attempt.attempt(name, driver, seed=seed, seeds=seeds, width=width, run=run, out=out)
+            folder = attempt.attempt(name, driver, **vars(attempts))
             print(f"{name}, {driver}: {told(files.read_json(folder / 'outcome.json'))}; look into {folder}")
 
 
