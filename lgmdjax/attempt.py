@@ -85,7 +85,7 @@ def walk(folder: Path, tried: Attempt, robot: simulation.Params, seed: int) -> t
 
 
 def summary(trial: trials.Trial, record: Record) -> dict[str, Any]:
-    """Sum up a trial: the share that got through, or collisions per 100 m where robots walk on after a touch."""
+    """Sum up a trial: the share that stayed untouched, or collisions per 100 m where robots walk on after a touch."""
     if not trial.ends:
         return asdict(scores.score(record, cpg.CYCLE_TIME))
     outcome = trials.judge(trial, record)
@@ -93,6 +93,7 @@ def summary(trial: trials.Trial, record: Record) -> dict[str, Any]:
         "robots": len(outcome.touched),
         "untouched": int((~outcome.touched).sum()),
         "avoided": asdict(outcome.avoided()),
+        "passed": int(outcome.passed.sum()),
         "retreated": int(outcome.retreated.sum()),
         "clearance": outcome.clearance.tolist(),
         "seconds": (outcome.frames / FRAME_RATE).tolist(),

@@ -39,6 +39,7 @@ from numpy import ndarray
 from lgmdjax.arena import Arena, Prisms, is_overhead, is_parked
 
 WIDTH = 7.2  # inches, the width of the report's column
+SURROUNDINGS = 2.5  # m, of the start of a trial that are drawn in any case
 LEFT, RIGHT = "#0072B2", "#D55E00"
 INK, QUIET, FAINT, OBSTACLE, ALARM = "#222222", "#767676", "#dddddd", "#c9c5bd", "#c1121f"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -418,9 +419,12 @@ def passages(
     for path, bad in zip(paths, touched, strict=True):
         axes.plot(*path[::8].T, color=ALARM if bad else LEFT, linewidth=0.9, alpha=0.7, zorder=3)
         axes.plot(*path[-1], "X" if bad else "o", color=ALARM if bad else LEFT, markersize=4, zorder=4)
-    least, most = (extreme([extreme(path, axis=0) for path in paths], axis=0) for extreme in (np.min, np.max))
+    things = np.concatenate([np.asarray(prisms.centre) for prisms in (arenas[0].boxes, arenas[0].cylinders)])
+    near = things[np.linalg.norm(things - paths[0][0], axis=1) < SURROUNDINGS]
+    shown = np.concatenate([*paths, near])
+    least, most = shown.min(axis=0), shown.max(axis=0)
     axes.set(xlim=(least[0] - 0.4, most[0] + 0.8), ylim=(least[1] - 0.8, most[1] + 0.8))
-    axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{np.sum(~touched)} of {len(paths)} got through", aspect="equal")
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{np.sum(~touched)} of {len(paths)} untouched", aspect="equal")
     axes.grid(False)
     return figure
 

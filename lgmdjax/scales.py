@@ -125,7 +125,7 @@ class Sensitivity:
     """The robot with one thing changed at a time, and pupils of less data, from `seeds` starts each."""
 
     bench: Bench
-    epochs: int
+    epochs: int  # of a fit to all data; see `studies.sensitivity.fair` for less
     seeds: int
 
 
@@ -196,7 +196,7 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         ),
         "printed": Printed(bench=Bench(eyes=_QUICK, robots=16, seconds=60)),
         "failures": Failures(bench=Bench(eyes=_QUICK, robots=16, seconds=50)),
-        "sensitivity": Sensitivity(bench=Bench(eyes=_QUICK, robots=16, seconds=60), epochs=60, seeds=2),
+        "sensitivity": Sensitivity(bench=Bench(eyes=_QUICK, robots=16, seconds=60), epochs=30, seeds=2),
         "report": Report(video_seconds=30),
     },
 }

@@ -12,8 +12,8 @@
 | corner   | sec. 5.4          | a corner of two walls ahead                                  |
 
 In `testing` and `unseen` a robot that touches something is set back and walks on: collisions are counted per 100 m
-(`lgmdjax.scores`). The others ask whether it got through untouched, up to the frame in which it had passed what
-stood in its way, had turned back, or had walked for long enough.
+(`lgmdjax.scores`). The others ask whether it stayed untouched, up to the frame in which it had passed what stood in
+its way, or had walked for long enough; a robot that turns back walks about until then.
 
 A seed draws textures, by a key of its own that no training room has, and where exactly the robot is put down: within
 a centimetre, and two degrees. With half the seeds the room is mirrored.
@@ -62,10 +62,11 @@ class Outcome:
     touched: np.ndarray  # something, or was lost
     frames: np.ndarray  # until the end
     clearance: np.ndarray  # m, the least
-    retreated: np.ndarray  # it turned back
+    passed: np.ndarray  # untouched, and beyond what stood in its way
+    retreated: np.ndarray  # untouched, turned back, and not passed
 
     def avoided(self) -> Estimate:
-        """Estimate the share of robots that got through, with Wilson's interval."""
+        """Estimate the share of robots that stayed untouched, with Wilson's interval."""
         return wilson(int((~self.touched).sum()), len(self.touched))
 
 
@@ -74,16 +75,19 @@ def judge(trial: Trial, record: Record) -> Outcome:
     x, heading = np.asarray(record.position)[..., 0], np.unwrap(yaws(np.asarray(record.quaternion)), axis=1)
     turned = np.abs(heading - heading[:, :1]) > TURNED_BACK
     bad = np.asarray(record.contact) | ~np.asarray(record.ok)
-    over = bad | turned | (x > trial.beyond)
+    beyond = x > trial.beyond
+    over = bad | beyond
     over[:, -1] = True
     end = over.argmax(axis=1)
     at_end = (np.arange(len(end)), end)
     until = np.arange(x.shape[1]) <= end[:, None]
+    touched, passed = bad[at_end], (beyond & ~bad)[at_end]
     return Outcome(
-        touched=bad[at_end],
+        touched=touched,
         frames=end + 1,
         clearance=np.where(until, record.clearance, np.inf).min(axis=1),
-        retreated=(turned & ~bad)[at_end],
+        passed=passed,
+        retreated=(turned & until).any(axis=1) & ~touched & ~passed,
     )
 
 
@@ -140,7 +144,7 @@ TRIALS = {
             shows="Sixteen obstacles, from (0, 2.5).",
             rooms=lambda key, seeds: rollout.copies(key, scenes.testing_room(), seeds),
             seeds=5,
-            seconds=800.0,
+            seconds=840.0,
             ends=False,
         ),
         Trial(
@@ -162,7 +166,7 @@ TRIALS = {
             shows="A tube 1.25 m ahead, up to 0.42 m to a side, before a white wall; below, how near the robot came.",
             rooms=_tubes,
             seeds=8,
-            seconds=32.0,
+            seconds=40.0,
             beyond=TUBE + 0.4,
             across=LATERALS,
         ),
@@ -197,6 +201,7 @@ TRIALS = {
             rooms=_alike(scenes.dynamic_scene),
             seeds=10,
             seconds=60.0,
+            beyond=2.2,
         ),
         Trial(
             name="white",

@@ -102,7 +102,7 @@ def rows_of(study: str) -> list[dict]:
         row = {"case": "eq. 15", "speed": 0.05, "u": {"score": 0.7, "left": 0.5, "right": 0.6}}
         return [row | {"teacher": rate, "learned": rate}, row | {"case": "eq. 1", "teacher": stuck, "learned": stuck}]
     if study == "failures":
-        away = {"avoided": asdict(scores.wilson(9, 12)), "untouched": 9, "robots": 12, "retreated": 2}
+        away = {"avoided": asdict(scores.wilson(9, 12)), "untouched": 9, "robots": 12, "passed": 6, "retreated": 2}
         walls = [{"place": "white", "contrast": c, "driver": "learned"} | away for c in (0.0, 0.5)]
         others = [{"place": "white", "contrast": 0.0, "driver": "teacher"} | away]
         corners = [{"place": "corner", "contrast": None, "driver": name} | away for name in ("learned", "eq. 22")]
@@ -122,7 +122,14 @@ def write_experiments(run: Path) -> Path:
         _json(run / study / f"{study}.json", rows_of(study))
     _json(run / "run.json", facts)
     evaluation = json.loads((run / "evaluate" / "evaluation.json").read_text())
-    outcome = {"robots": 30, "untouched": 29, "retreated": 4, "clearance": [0.1] * 30, "seconds": [20.0] * 30}
+    outcome = {
+        "robots": 30,
+        "untouched": 29,
+        "passed": 25,
+        "retreated": 4,
+        "clearance": [0.1] * 30,
+        "seconds": [20.0] * 30,
+    }
     outcome["avoided"] = asdict(scores.wilson(29, 30))
     evaluation["tube"] = dict.fromkeys(("teacher", "learned", "blind"), outcome)
     _json(run / "evaluate" / "evaluation.json", evaluation)

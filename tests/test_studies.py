@@ -114,7 +114,7 @@ def test_every_axis_of_sensitivity_has_the_chosen_value_once(robot):
 def test_lessons_are_of_the_minutes_and_rooms_asked_for():
     generator = np.random.default_rng(1)
     walks = []
-    for room in range(8):
+    for room in range(16):
         record = vars(synthetic.walk(1, int(generator.integers(400, 900))))
         fields = {name: np.asarray(leaf)[0] for name, leaf in record.items()}
         walks.append(episodes.Walk(episode=0, robot=room, room=room, seed=0, **fields))
@@ -124,10 +124,16 @@ def test_lessons_are_of_the_minutes_and_rooms_asked_for():
         assert sum(map(len, some)) / 1800 == pytest.approx(value, abs=0.01)
         assert value <= whole + 1e-9
     rooms = [(value, some) for axis, value, some in asked if axis == "rooms"]
-    assert [value for value, _ in rooms] == [2, 4, 8]
+    assert [value for value, _ in rooms] == [8, 16]
     for value, some in rooms:
         assert len({walk.room for walk in some}) == value
         assert sum(map(len, some)) == pytest.approx(sum(map(len, rooms[0][1])), abs=2 * value)
+
+
+def test_fits_to_less_take_as_many_steps_up_to_a_bound():
+    assert sensitivity.fair(30, 8000, 8000) == 30
+    assert sensitivity.fair(30, 8000, 2000) == 120
+    assert sensitivity.fair(30, 8000, 10) == 30 * sensitivity.LONGEST
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 1.0, 3.0])

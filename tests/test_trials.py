@@ -63,15 +63,20 @@ def test_a_robot_that_passes_has_got_through_whatever_it_touches_later():
 
 
 def test_a_robot_that_turns_back_has_retreated_and_one_that_is_lost_has_not_got_through():
-    yaw = np.zeros((2, 1200))
+    """A third one comes round again, and passes."""
+    yaw = np.zeros((3, 1200))
     yaw[0] = np.linspace(0, 3.0, 1200)
-    ok = np.ones((2, 1200), bool)
+    yaw[2, 100:300] = 3.0
+    ok = np.ones((3, 1200), bool)
     ok[1, 600:] = False
+    position = np.zeros((3, 1200, 3))
+    position[2, 900:, 0] = 2.0
     quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
-    outcome = trials.judge(TUBE, walk(quaternion=quaternion, ok=ok))
-    assert outcome.retreated.tolist() == [True, False]
-    assert outcome.touched.tolist() == [False, True]
-    assert outcome.frames[0] == pytest.approx(1199 * np.pi / 2 / 3.0, abs=2)
+    outcome = trials.judge(TUBE, walk(3, quaternion=quaternion, ok=ok, position=position))
+    assert outcome.retreated.tolist() == [True, False, False]
+    assert outcome.passed.tolist() == [False, False, True]
+    assert outcome.touched.tolist() == [False, True, False]
+    assert outcome.frames.tolist() == [1200, 601, 901]
 
 
 def test_a_robot_that_stays_out_is_judged_at_the_end():

@@ -73,7 +73,8 @@ def told(outcome: Mapping[str, Any]) -> str:
     """Say in a line what came of a trial."""
     if "per_100_m" in outcome:
         return f"{outcome['collisions']} collisions in {outcome['distance']:.0f} m"
-    return f"{outcome['untouched']} of {outcome['robots']} untouched, {outcome['retreated']} of them turned back"
+    untouched = f"{outcome['untouched']} of {outcome['robots']} untouched"
+    return f"{untouched}; {outcome['passed']} passed, {outcome['retreated']} turned back"
 
 
 def _inputs(run: Path | None) -> dict[str, Path]:

@@ -43,8 +43,9 @@ EVERY = (1, 2, 3, 4)  # frames from one picture to the next
 CONTRASTS = (0.25, 0.5, 0.75, 1.0, 1.25)
 SWAYS = (0.0, 1.0, 2.0, 4.0)
 SHORTEST = 30  # frames of a stretch that is cut
-SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the minutes recorded
-ROOMS = (2, 4, 8, 16, 32, 64)
+SHARES = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the minutes recorded
+LONGEST = 10  # times the epochs of a fit to everything, for fits to less
+ROOMS = (8, 16, 32, 64, 128)
 AXES = {
     "T_s": "T_s, as a multiple of the chosen",
     "T_f": "T_f, as a multiple of the chosen",
@@ -63,13 +64,15 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity,
     """Score the robot with every change, and every pupil."""
     robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
     recorded = _recorded(inputs)  # before hours of walking
+    frames = sum(map(len, episodes.stretches(recorded)))
     rows, chosen = [], settled(settings.bench.eyes)
     for axis, value, changed, contrast in changes(robot, settings.bench.eyes):
         rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
     for axis, value, walks in lessons(recorded, seed):
+        epochs = fair(settings.epochs, frames, sum(map(len, walks)))
         for start in range(settings.seeds):
             place = folder / "pupils" / f"{axis}-{value:g}-{start}"
-            pupil = crew.manned(robot, _fit(place, walks, settings.epochs, seed + start))
+            pupil = crew.manned(robot, _fit(place, walks, epochs, seed + start))
             rows.append(_score(folder, pupil, settings.bench, seed, axis, value, start=start))
     rows = [row | {"chosen": row["value"] == chosen.get(row["axis"])} for row in rows]
     files.write_json(folder / "sensitivity.json", rows)
@@ -121,9 +124,14 @@ def lessons(walks: Sequence[Walk], seed: int) -> Iterator[tuple[str, float, list
     rooms = generator.permutation(sorted({stretch.room for stretch in stretches}))
     few = {count: set(rooms[:count].tolist()) for count in ROOMS if count <= len(rooms)}
     shown = {count: [stretch for stretch in stretches if stretch.room in some] for count, some in few.items()}
-    least = min(sum(map(len, some)) for some in shown.values())
+    least = min((sum(map(len, some)) for some in shown.values()), default=0)
     for count, some in shown.items():
         yield "rooms", count, _evenly(some, least)
+
+
+def fair(epochs: int, frames: int, shown: int) -> int:
+    """Let a fit that is shown less take as many steps as one to everything: more epochs, but not without end."""
+    return round(epochs * min(frames / shown, LONGEST))
 
 
 def _cut(stretches: Sequence[Walk], frames: int) -> list[Walk]:
