@@ -136,6 +136,8 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "coarse": _coarse(facts["settings"]),
         "experiments": trials.TRIALS,
         "studied": studied,
+        "best_velocity": velocity.best(studied["velocity"]) if "velocity" in studied else None,
+        "band": velocity.BAND,
         "pupils": teaching.pooled(studied.get("teaching", [])),
         "stages": stages,
         "versions": versions(stages),
@@ -152,6 +154,10 @@ def _coarse(settings: Mapping[str, Any]) -> dict[str, str]:
     train, paper = settings["train"].get("eyes"), camera.Params()
     eyes = {"while it learned": train} if train else {}
     eyes |= {f"in {PLACES[place['trial']]}": place["eyes"] for place in settings["evaluate"]["places"]}
+    others = [place["coarse"] for place in settings["evaluate"]["places"] if place.get("coarse")]
+    eyes |= {"of the other drivers": others[0]} if others else {}
+    studies = {name: settings[name] for name in STUDIES if name in settings}
+    eyes |= {f"in the study of {name}": study.get("eyes") or study["bench"]["eyes"] for name, study in studies.items()}
     small = {where: (e["width"], e["height"]) for where, e in eyes.items() if e["width"] < paper.width}
     return {where: f"{width} × {height}" for where, (width, height) in small.items()}
 
@@ -162,6 +168,7 @@ def verdict(scores: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "ratio": learned["value"] / blind["value"] if blind["value"] else math.nan,
         "half": learned["value"] < 0.5 * blind["value"],
+        "tenth": learned["value"] < 0.1 * blind["value"],
         "apart": learned["high"] < blind["low"],
     }
 

@@ -68,6 +68,7 @@ class Place:
     trial: str
     eyes: Eyes
     seeds: int
+    coarse: Eyes | None = None  # of all drivers but the learned one, if it is drawn finer than they
     seconds: float | None = None
     drivers: tuple[str, ...] = ("teacher", "learned", "blind", "direct", "random")
 
@@ -90,9 +91,11 @@ class Bench:
 
 @dataclass(frozen=True, kw_only=True)
 class Velocity:
-    """The eyes of a robot that walks straight on, at multiples of the nominal velocity."""
+    """The eyes of a robot that walks straight on, at multiples of the nominal velocity, as far at each."""
 
-    bench: Bench
+    eyes: Eyes
+    robots: int
+    metres: float  # of each robot, at each velocity
     velocities: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0)
 
 
@@ -140,7 +143,6 @@ _SMALL = Eyes(width=64, height=48, pooling=2)
 _QUICK = Eyes(width=80, height=60, pooling=3)
 _SMALLER = Eyes(width=160, height=120, pooling=6)
 _PAPER = Eyes(width=320, height=240, pooling=12)
-_SOME = ("teacher", "learned", "blind")
 
 SCALES: Mapping[Scale, Mapping[str, Any]] = {
     "smoke": {
@@ -177,17 +179,17 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         ),
         "evaluate": Evaluate(
             places=(
-                Place(trial="testing", eyes=_PAPER, seeds=5, drivers=_SOME),
+                Place(trial="testing", eyes=_PAPER, coarse=_QUICK, seeds=5),
                 Place(trial="unseen", eyes=_QUICK, seeds=64),
-                Place(trial="tube", eyes=_PAPER, seeds=8, drivers=_SOME),
-                Place(trial="indoor", eyes=_PAPER, seeds=12, drivers=_SOME),
-                Place(trial="outdoor", eyes=_PAPER, seeds=10, drivers=_SOME),
-                Place(trial="dynamic", eyes=_PAPER, seeds=10, drivers=_SOME),
-                Place(trial="white", eyes=_QUICK, seeds=12, drivers=_SOME),
-                Place(trial="corner", eyes=_QUICK, seeds=12, drivers=_SOME),
+                Place(trial="tube", eyes=_PAPER, coarse=_QUICK, seeds=8),
+                Place(trial="indoor", eyes=_PAPER, coarse=_QUICK, seeds=12),
+                Place(trial="outdoor", eyes=_PAPER, coarse=_QUICK, seeds=10),
+                Place(trial="dynamic", eyes=_PAPER, coarse=_QUICK, seeds=10),
+                Place(trial="white", eyes=_QUICK, seeds=12),
+                Place(trial="corner", eyes=_QUICK, seeds=12),
             )
         ),
-        "velocity": Velocity(bench=Bench(eyes=_SMALLER, robots=16, seconds=20)),
+        "velocity": Velocity(eyes=_SMALLER, robots=16, metres=1.2),
         "teaching": Teaching(
             bench=Bench(eyes=_QUICK, robots=16, seconds=90),
             practice=Train(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=60),
@@ -195,7 +197,7 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
             seeds=3,
         ),
         "printed": Printed(bench=Bench(eyes=_QUICK, robots=16, seconds=60)),
-        "failures": Failures(bench=Bench(eyes=_QUICK, robots=16, seconds=50)),
+        "failures": Failures(bench=Bench(eyes=_QUICK, robots=16, seconds=90)),
         "sensitivity": Sensitivity(bench=Bench(eyes=_QUICK, robots=16, seconds=60), epochs=30, seeds=2),
         "report": Report(video_seconds=30),
     },

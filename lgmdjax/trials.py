@@ -144,7 +144,7 @@ TRIALS = {
             shows="Sixteen obstacles, from (0, 2.5).",
             rooms=lambda key, seeds: rollout.copies(key, scenes.testing_room(), seeds),
             seeds=5,
-            seconds=840.0,
+            seconds=960.0,
             ends=False,
         ),
         Trial(
@@ -190,7 +190,7 @@ TRIALS = {
             rooms=_alike(scenes.outdoor_scene),
             seeds=10,
             seconds=60.0,
-            beyond=4.0,
+            beyond=2.8,
         ),
         Trial(
             name="dynamic",
@@ -211,7 +211,7 @@ TRIALS = {
             shows="Walls without contrast make no edges: a detector of edges cannot see them but for their rims.",
             rooms=_alike(_white),
             seeds=12,
-            seconds=40.0,
+            seconds=60.0,
         ),
         Trial(
             name="corner",
@@ -221,7 +221,7 @@ TRIALS = {
             shows="Walking into the corner of two walls, the robot has as much before the one eye as before the other.",
             rooms=_alike(_corner),
             seeds=12,
-            seconds=50.0,
+            seconds=90.0,
         ),
     )
 }

@@ -93,7 +93,10 @@ def rows_of(study: str) -> list[dict]:
     rate = {"per_100_m": asdict(scores.poisson_rate(2, 0.9)), "distance": 90.0, "collisions": 2}
     if study == "velocity":
         row = {"obstructed": 0.6, "free": 0.55, "spread": 0.02}
-        return [row | {"velocity": v, "effect": v, "speed": 0.05 * v} for v in (0.1, 1.0, 5.0)]
+        return [
+            row | {"velocity": v, "effect": v, "low": v - 0.1, "high": v + 0.1, "speed": 0.05 * v}
+            for v in (0.1, 1.0, 5.0)
+        ]
     if study == "teaching":
         pupils = [{"driver": "learned", "rule": "2a", "variant": "lstm", "start": start} | rate for start in range(3)]
         return [{"driver": "teacher", "rule": "2a"} | rate, {"driver": "direct", "rule": "teacher"} | rate, *pupils]
@@ -116,7 +119,7 @@ def write_experiments(run: Path) -> Path:
     facts = json.loads((run / "run.json").read_text())
     facts["settings"]["evaluate"]["places"].append({"trial": "tube", "eyes": {"width": 320, "height": 240}})
     for study in ("velocity", "teaching", "printed", "failures", "sensitivity"):
-        facts["settings"][study] = {"bench": {"robots": 16}}
+        facts["settings"][study] = {"bench": {"robots": 16, "eyes": {"width": 80, "height": 60}}}
         (run / study).mkdir()
         (run / study / "done.json").write_bytes((run / "train" / "done.json").read_bytes())
         _json(run / study / f"{study}.json", rows_of(study))

@@ -12,7 +12,7 @@ import pytest
 import synthetic
 from scipy.spatial.transform import Rotation
 
-from lgmdjax import braitenberg, calibration, episodes, figures, hexapod, scales, scores, simulation, trials
+from lgmdjax import arena, braitenberg, calibration, episodes, figures, hexapod, scales, scores, simulation, trials
 from lgmdjax.stages import STUDIES, crew
 from lgmdjax.studies import alone, failures, printed, sensitivity, teaching, velocity
 
@@ -42,13 +42,34 @@ def test_velocity_tells_obstructed_frames_from_free_ones():
     distance = np.where(np.arange(1500) % 500 < 250, 0.4, 3.0)
     noise = np.repeat(generator.normal(0, 0.02, (4, 60, 1)), 25, axis=1)
     u = np.where(distance < 1, 0.6, 0.5)[None, :, None] + noise
-    near_and_far = np.broadcast_to(distance[None, :, None], (4, 1500, 2))
-    changed = replace(record, u=np.repeat(u, 2, axis=-1), distances=near_and_far)
-    row = velocity.measure(1.5, changed, suppression=1.0)
+    changed = replace(record, u=np.repeat(u, 2, axis=-1))
+    row = velocity.measure(1.5, changed, np.broadcast_to(distance, (4, 1500)), suppression=1.0)
     assert row.obstructed == pytest.approx(0.6, abs=0.01) and row.free == pytest.approx(0.5, abs=0.01)
     assert row.effect == pytest.approx(0.1 / row.spread, rel=0.15)
+    assert row.low < row.effect < row.high and row.high - row.low < 0.2 * row.effect
     assert row.speed == pytest.approx(0.05, rel=0.1)  # what is left of the sway counts as way
     assert row.silenced == 0
+
+
+def test_velocity_without_frames_of_both_kinds_has_no_effect_and_is_not_the_best():
+    record = synthetic.walk(robots=2, frames=300)
+    blank = velocity.measure(0.1, record, np.full((2, 300), 3.0), suppression=1.0)
+    assert np.isnan(blank.effect) and np.isnan(blank.low) and blank.frames[0] == 0 < blank.frames[1]
+    rows = [asdict(blank), asdict(blank) | {"velocity": 1.2, "effect": 0.4}]
+    assert velocity.best(rows)["velocity"] == 1.2
+    assert velocity.draw(rows).axes
+
+
+def test_ahead_is_measured_in_a_sector_straight_ahead(robot):
+    """A box whose face is 1 m before the laser, which is 0.1 m or so before the middle; at a right angle nothing."""
+    boxes = arena.place([[1.5, 0.0]], [[0.25, 0.25]], 0.8)
+    room = jax.tree.map(lambda leaf: leaf[None], arena.empty_room((6.0, 6.0), boxes=boxes))
+    turned = np.array([[1.0, 0, 0, 0], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])[None]
+    record = synthetic.walk(1, 2, quaternion=turned, position=np.array([[[0.0, 0, 0.1], [0, 0, 0.1]]]))
+    forward, aside = velocity.ahead(room, record)[0]
+    at = float(hexapod.laser_pose(hexapod.Pose(position=jnp.zeros(3), quaternion=jnp.asarray(turned[0, 0])))[0][0])
+    assert forward == pytest.approx(1.25 - at, abs=1e-3)
+    assert aside > 2.0
 
 
 def test_at_velocity_seats_a_blind_driver_of_that_velocity(robot):
@@ -99,7 +120,7 @@ def test_walls_are_papered_and_nothing_else():
 
 
 def test_every_axis_of_sensitivity_has_the_chosen_value_once(robot):
-    chosen = sensitivity.settled(EYES)
+    chosen = sensitivity.settled(robot, EYES)
     values: dict[str, list[float]] = {}
     for axis, value, changed, contrast in sensitivity.changes(robot, EYES):
         values.setdefault(axis, []).append(value)

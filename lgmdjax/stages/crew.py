@@ -216,10 +216,15 @@ def benched(
         folder: as in `walked`, and so are `label` and `draw`. bench: how many rooms, and how long.
         contrast: of all textures, by which theirs is multiplied.
     """
-    rooms = rollout.random_rooms(jax.random.fold_in(jax.random.key(seed), BENCH), bench.robots)
-    rooms = replace(rooms, arena=jax.vmap(scenes.faded, in_axes=(0, None))(rooms.arena, contrast))
+    rooms = bench_rooms(bench, seed, contrast)
     facts = {"bench": asdict(bench), "driver": driver.name, "contrast": contrast, "robot": digest(params)}
     return walked(folder, params, rooms, bench.seconds, driver, seed=seed, facts=facts, label=label, draw=draw)
+
+
+def bench_rooms(bench: scales.Bench, seed: int, contrast: float = 1.0) -> simulation.Room:
+    """Draw the rooms of `benched`."""
+    rooms = rollout.random_rooms(jax.random.fold_in(jax.random.key(seed), BENCH), bench.robots)
+    return replace(rooms, arena=jax.vmap(scenes.faded, in_axes=(0, None))(rooms.arena, contrast))
 
 
 def digest(params: simulation.Params) -> str:

@@ -53,9 +53,9 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
     result = {"curves": curves, "table": table, "minutes": minutes, "caution": training.CAUTION, "lost": lost}
     write_json(folder / "training.json", result)
     learned = training.enliven(fits["lstm"].best, test)
-    navigator.save(
-        folder / "controller.safetensors", learned, header | {"seed": seed, "training": dataclasses.asdict(settings)}
-    )
+    # The eyes that it learned with are those of its own walks, most of what it learned from.
+    facts = {"eyes": dataclasses.asdict(settings.eyes), "seed": seed, "training": dataclasses.asdict(settings)}
+    navigator.save(folder / "controller.safetensors", learned, header | facts)
     np.savez(folder / "prediction.npz", allow_pickle=False, **_prediction(learned, unseen))
 
 

@@ -6,7 +6,8 @@ with the navigator, which learned with the corrected robot and is not taught aga
 
 Writes printed.json, a row a case.
 
-Source: Cizek & Faigl, eqs. 1-5, 15, 16 and 22; the corrections are in `cpg`, `shaping`, `lgmd` and `braitenberg`.
+Source: Cizek & Faigl, secs. 3.2 and 3.3, eqs. 1-5, 15, 16 and 22; the corrections are in `cpg`, `shaping`, `lgmd`,
+`camera` and `braitenberg`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -90,11 +91,19 @@ def _literal(robot: simulation.Params, folder: Path) -> simulation.Params:
     return replace(robot, controller=replace(robot.controller, shaping=networks))
 
 
+def _same_picture(robot: simulation.Params, _: Path) -> simulation.Params:
+    """Show each detector all that its eye sees."""
+    eyes = robot.camera
+    whole = scales.Eyes(width=eyes.width, height=eyes.height, overlap=1.0, pooling=robot.controller.lgmd.pooling)
+    return crew.with_eyes(robot, whole)
+
+
 CASES: Mapping[str, Change] = {
     "all corrected": lambda robot, _: robot,
     "eqs. 1, 3: sign of w_fe": _rhythm(printed_sign=True),
     "eqs. 1, 3: coupling W": _rhythm(coupling=cpg.coupling(within_tripod=0.40, across=0.04)),
     "sec. 3.2: one input a leg": _literal,
+    "sec. 3.3: whole pictures": _same_picture,
     "eq. 15: signed sum": _detector(printed_feed_forward=True),
     "eq. 16: gate": _detector(printed_gate=True),
     "eq. 22: rule alone": lambda robot, _: teaching.under(robot, "eq. 22"),

@@ -5,7 +5,8 @@ amount of data pupils learn anew, from parts of the walks that the run recorded.
 
 | axis       | changed                                                                             |
 | ---------- | ----------------------------------------------------------------------------------- |
-| T_s, T_f   | thresholds of the detector, as multiples of the chosen ones                         |
+| T_s        | threshold of the detector                                                           |
+| T_f        | threshold of its gate, as a multiple of the chosen one                              |
 | overlap    | share of its picture that each eye looks at                                         |
 | pixels     | of a picture's width, with cells of the same size in degrees                         |
 | cell       | pixels of a picture of the bench's size that a cell looks at, a side                |
@@ -34,7 +35,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE
 from lgmdjax.stages import crew
 
-THRESHOLDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+THRESHOLDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # grey, and the chosen one
 SUPPRESSIONS = (0.1, 0.2, 0.4, 0.7, 1.0, 2.0)
 OVERLAPS = (0.5, 0.6, 0.7, 0.8, 1.0)
 SIZES = ((54, 40, 2), (80, 60, 3), (160, 120, 6), (320, 240, 12))  # width, height, pixels a cell
@@ -42,12 +43,13 @@ CELLS = (1, 2, 3, 4, 6)
 EVERY = (1, 2, 3, 4)  # frames from one picture to the next
 CONTRASTS = (0.25, 0.5, 0.75, 1.0, 1.25)
 SWAYS = (0.0, 1.0, 2.0, 4.0)
+MOST = 60.0  # collisions per 100 m that are drawn; more is an arrow
 SHORTEST = 30  # frames of a stretch that is cut
 SHARES = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the minutes recorded
 LONGEST = 10  # times the epochs of a fit to everything, for fits to less
 ROOMS = (8, 16, 32, 64, 128)
 AXES = {
-    "T_s": "T_s, as a multiple of the chosen",
+    "T_s": "T_s [grey]",
     "T_f": "T_f, as a multiple of the chosen",
     "overlap": "share of the picture that each eye looks at",
     "pixels": "width of a picture [px], cells the same",
@@ -65,7 +67,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity,
     robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
     recorded = _recorded(inputs)  # before hours of walking
     frames = sum(map(len, episodes.stretches(recorded)))
-    rows, chosen = [], settled(settings.bench.eyes)
+    rows, chosen = [], settled(robot, settings.bench.eyes)
     for axis, value, changed, contrast in changes(robot, settings.bench.eyes):
         rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
     for axis, value, walks in lessons(recorded, seed):
@@ -78,10 +80,11 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity,
     files.write_json(folder / "sensitivity.json", rows)
 
 
-def settled(eyes: scales.Eyes) -> dict[str, float]:
+def settled(robot: simulation.Params, eyes: scales.Eyes) -> dict[str, float]:
     """Name the value of each axis that the robot of a bench has by itself."""
-    own = {"overlap": eyes.overlap, "pixels": eyes.width, "cell": eyes.pooling, "rate": FRAME_RATE}
-    return own | dict.fromkeys(("T_s", "T_f", "contrast", "sway"), 1.0)
+    threshold = round(float(robot.controller.lgmd.threshold), 6)  # as it was before it became a float32
+    own = {"T_s": threshold, "overlap": eyes.overlap, "pixels": eyes.width, "cell": eyes.pooling, "rate": FRAME_RATE}
+    return own | dict.fromkeys(("T_f", "contrast", "sway"), 1.0)
 
 
 def changes(robot: simulation.Params, eyes: scales.Eyes) -> Iterator[tuple[str, float, simulation.Params, float]]:
@@ -91,8 +94,8 @@ def changes(robot: simulation.Params, eyes: scales.Eyes) -> Iterator[tuple[str, 
     def seeing(**constants: Any) -> simulation.Params:
         return replace(robot, controller=replace(robot.controller, lgmd=replace(detector, **constants)))
 
-    for factor in THRESHOLDS:
-        yield "T_s", factor, seeing(threshold=factor * detector.threshold), 1.0
+    for threshold in sorted({*THRESHOLDS, settled(robot, eyes)["T_s"]}):
+        yield "T_s", threshold, seeing(threshold=jnp.asarray(threshold, float)), 1.0
     for factor in SUPPRESSIONS:
         yield "T_f", factor, seeing(suppression=factor * detector.suppression), 1.0
     for overlap in OVERLAPS:
@@ -120,13 +123,14 @@ def lessons(walks: Sequence[Walk], seed: int) -> Iterator[tuple[str, float, list
     stretches = [stretches[k] for k in generator.permutation(len(stretches))]
     frames = sum(map(len, stretches))
     for share in SHARES:
-        yield "minutes", share * frames / FRAME_RATE / 60, _cut(stretches, round(share * frames))
+        some = _evenly(stretches, round(share * frames), generator)
+        yield "minutes", share * frames / FRAME_RATE / 60, some
     rooms = generator.permutation(sorted({stretch.room for stretch in stretches}))
     few = {count: set(rooms[:count].tolist()) for count in ROOMS if count <= len(rooms)}
     shown = {count: [stretch for stretch in stretches if stretch.room in some] for count, some in few.items()}
     least = min((sum(map(len, some)) for some in shown.values()), default=0)
     for count, some in shown.items():
-        yield "rooms", count, _evenly(some, least)
+        yield "rooms", count, _evenly(some, least, generator)
 
 
 def fair(epochs: int, frames: int, shown: int) -> int:
@@ -134,17 +138,22 @@ def fair(epochs: int, frames: int, shown: int) -> int:
     return round(epochs * min(frames / shown, LONGEST))
 
 
-def _cut(stretches: Sequence[Walk], frames: int) -> list[Walk]:
-    """Take stretches until there are so many frames; the last one is cut."""
-    starts = np.cumsum([0, *map(len, stretches)])
-    return [
-        stretch[: frames - start]
-        for start, stretch in zip(starts.tolist(), stretches, strict=False)
-        if frames - start >= SHORTEST
-    ] or [stretches[0][:frames]]
+def _cut(stretches: Sequence[Walk], frames: int, generator: np.random.Generator) -> list[Walk]:
+    """Take stretches until there are so many frames; of the last one a part anywhere in it.
+
+    Its beginning would be of a robot just put down, with little near.
+    """
+    starts = np.cumsum([0, *map(len, stretches)]).tolist()
+    cut = []
+    for start, stretch in zip(starts, stretches, strict=False):
+        left = frames - start
+        if left >= max(min(SHORTEST, frames), 1):
+            first = int(generator.integers(max(len(stretch) - left, 0) + 1))
+            cut.append(stretch[first : first + left])
+    return cut
 
 
-def _evenly(stretches: Sequence[Walk], frames: int) -> list[Walk]:
+def _evenly(stretches: Sequence[Walk], frames: int, generator: np.random.Generator) -> list[Walk]:
     """Take as many frames of every room, as far as there are, until there are so many in all."""
     rooms: dict[int, list[Walk]] = {}
     for stretch in stretches:
@@ -152,7 +161,7 @@ def _evenly(stretches: Sequence[Walk], frames: int) -> list[Walk]:
     left, chosen = frames, []
     for number, some in enumerate(sorted(rooms.values(), key=lambda some: sum(map(len, some)))):
         share = min(left // (len(rooms) - number), sum(map(len, some)))
-        chosen += _cut(some, share)
+        chosen += _cut(some, share, generator)
         left -= share
     return chosen
 
@@ -194,7 +203,9 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
         positions = {value: place for place, value in enumerate(sorted(set(values)))}
         x = np.array([positions[value] for value in values]) + 0.12 * np.array([row.get("start", 0) for row in some])
         panel.vlines(x, rates[:, 1], rates[:, 2], color=figures.LEFT, alpha=0.45, linewidth=1.6)
-        panel.plot(x, rates[:, 0], "o", color=figures.LEFT, markersize=4, clip_on=False, zorder=3)
+        beyond = rates[:, 0] > MOST
+        panel.plot(x[~beyond], rates[~beyond, 0], "o", color=figures.LEFT, markersize=4, clip_on=False, zorder=3)
+        panel.plot(x[beyond], np.full(beyond.sum(), MOST), "^", color=figures.LEFT, markersize=5, clip_on=False)
         ringed = np.array([row["chosen"] for row in some])
         panel.plot(x[ringed], rates[ringed, 0], "o", markersize=9, markerfacecolor="none", color=figures.INK)
         panel.set_xticks(list(positions.values()), [f"{value:.3g}" for value in positions])
@@ -202,6 +213,6 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
         panel.grid(False, axis="x")
     for panel in panels[len(axes_of) :]:
         panel.remove()
-    panels[0].set_ylim(0, min(panels[0].get_ylim()[1], 60.0))
+    panels[0].set_ylim(0, min(panels[0].get_ylim()[1], MOST))
     figure.supylabel("collisions per 100 m", fontsize=8.5)
     return figure

@@ -1,38 +1,43 @@
 """How fast should the robot walk for its eyes? Fig. 9: the mean response of the detectors against velocity.
 
-A robot that looks at nothing walks straight on through random rooms at 0.1 to 5 times the nominal velocity. A frame
-counts as obstructed when the scanner has something within `NEAR` ahead, as free when it has nothing within `FAR`; the
-mean response of both eyes, averaged over about a gait cycle, is compared between the two. Where they are furthest
-apart in standard deviations (Cohen's d), the detector tells best whether the way is free.
+A robot that looks at nothing walks straight on through random rooms at 0.1 to 5 times the nominal velocity, as far at
+each. A frame counts as obstructed when something stands within `NEAR` of the laser in a sector straight ahead, as free
+when nothing does within `FAR`; the mean response of both eyes, averaged over about a gait cycle, is compared between
+the two. Where they are furthest apart in standard deviations (Cohen's d), the detector tells best whether the way is
+free. Intervals are bootstrapped over robots: frames of one walk are alike.
 
 Writes velocity.json, a row a velocity, and the walks.
 
 Source: Cizek & Faigl, sec. 4.2 and fig. 9.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 from matplotlib.figure import Figure
 from scipy import ndimage
 
-from lgmdjax import calibration, cpg, drivers, figures, files, scales, scores, simulation
-from lgmdjax.errors import InputError
+from lgmdjax import arena, calibration, cpg, drivers, figures, files, gait, hexapod, laser, scales, scores, simulation
 from lgmdjax.stages import crew
 
 NEAR, FAR = 0.6, 1.2  # m
+SECTOR = math.radians(40.0)  # straight ahead
 WINDOW = round(calibration.AVERAGED * simulation.FRAME_RATE)
+LEAST = 10.0  # s of a walk, however fast
+RESAMPLED = 1000
 BAND = (1.0, 1.4)  # of the nominal velocity: where the paper finds the two furthest apart
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What the eyes say at one velocity, where the way is obstructed and where it is free."""
+    """What the eyes say at one velocity, where the way is obstructed and where it is free; nan where it never was."""
 
     velocity: float  # asked for
     speed: float  # m/s, walked
@@ -40,20 +45,26 @@ class Row:
     free: float
     spread: float  # standard deviation of u, both pooled
     effect: float  # Cohen's d
+    low: float  # of its 95 % interval
+    high: float
     frames: tuple[int, int]  # obstructed, free
     silenced: float  # share of the frames in which the gate was shut
+    lost: int  # robots that fell
 
 
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Velocity, seed: int) -> None:
     """Walk at every velocity through the same rooms, and compare."""
-    robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+    robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
     rows = []
     for velocity in settings.velocities:
+        seconds = max(settings.metres / (velocity * float(gait.Gait().nominal_velocity)), LEAST)
+        bench = scales.Bench(eyes=settings.eyes, robots=settings.robots, seconds=seconds)
         record = crew.benched(
-            folder / f"{velocity:g}", at_velocity(robot, velocity), settings.bench, drivers.BLIND, seed,
+            folder / f"{velocity:g}", at_velocity(robot, velocity), bench, drivers.BLIND, seed,
             label=f"v = {velocity:g}", draw=True,
         )  # fmt: skip
-        rows.append(measure(velocity, record, float(robot.controller.lgmd.suppression)))
+        free = ahead(crew.bench_rooms(bench, seed).arena, record)
+        rows.append(measure(velocity, record, free, float(robot.controller.lgmd.suppression)))
     files.write_json(folder / "velocity.json", [asdict(row) for row in rows])
 
 
@@ -62,28 +73,59 @@ def at_velocity(robot: simulation.Params, velocity: float) -> simulation.Params:
     return crew.manned(robot, drivers.Blind(velocity=jnp.full(2, velocity, dtype=float)))
 
 
-def measure(velocity: float, record: simulation.Record, suppression: float) -> Row:
-    """Compare u where something is near with u where nothing is."""
+def ahead(rooms: arena.Arena, record: simulation.Record) -> Float[np.ndarray, "robots frames"]:
+    """Measure how far it is from the laser to the first thing in a sector straight ahead [m]."""
+    scanner = laser.Params(rays=21, field_of_view=SECTOR)
+
+    def look(room: arena.Arena, position: Array, quaternion: Array) -> Array:
+        pose = hexapod.Pose(position=position, quaternion=quaternion)
+        return jnp.min(laser.scan(scanner, room, *hexapod.laser_pose(pose)))
+
+    walk = jax.vmap(look, in_axes=(None, 0, 0))
+    poses = (jnp.asarray(record.position), jnp.asarray(record.quaternion))
+    return np.asarray(jax.jit(lambda *walks: jax.lax.map(lambda one: walk(*one), walks))(rooms, *poses))
+
+
+def measure(
+    velocity: float, record: simulation.Record, ahead: Float[np.ndarray, "robots frames"], suppression: float
+) -> Row:
+    """Compare u where something is near ahead with u where nothing is."""
     u = ndimage.uniform_filter1d(np.asarray(record.u).mean(axis=-1), WINDOW, axis=1)
-    steady, distance = _steady(record), np.asarray(record.distances).min(axis=-1)
-    near, far = u[steady & (distance < NEAR)], u[steady & (distance > FAR)]
-    if not (len(near) and len(far)):
-        raise InputError(
-            f"velocity {velocity:g}: expected frames with something within {NEAR} m and frames with nothing within "
-            f"{FAR} m, got {len(near)} and {len(far)}; walk more robots, or for longer"
-        )
-    spread = float(np.sqrt((near.var() * len(near) + far.var() * len(far)) / (len(near) + len(far))))
-    scored = scores.score(record, cpg.CYCLE_TIME)
+    steady = _steady(record)
+    near, far = (_moments(u, steady & there) for there in (ahead < NEAR, ahead > FAR))
+    obstructed, free, spread, effect = _compare(near.sum(axis=0), far.sum(axis=0))
+    chosen = np.random.default_rng(0).integers(0, len(u), (RESAMPLED, len(u)))
+    effects = [_compare(near[some].sum(axis=0), far[some].sum(axis=0))[-1] for some in chosen]
+    low, high = np.nanpercentile(effects, (2.5, 97.5)) if np.any(np.isfinite(effects)) else (math.nan, math.nan)
+    scored, silenced = scores.score(record, cpg.CYCLE_TIME), np.asarray(record.feed_forward)[steady] > suppression
     return Row(
         velocity=velocity,
         speed=scored.speed,
-        obstructed=float(near.mean()),
-        free=float(far.mean()),
+        obstructed=obstructed,
+        free=free,
         spread=spread,
-        effect=float((near.mean() - far.mean()) / max(spread, 1e-9)),
-        frames=(len(near), len(far)),
-        silenced=float((np.asarray(record.feed_forward)[steady] > suppression).mean()),
+        effect=effect,
+        low=float(low),
+        high=float(high),
+        frames=(int(near[:, 0].sum()), int(far[:, 0].sum())),
+        silenced=float(silenced.mean()) if silenced.size else math.nan,
+        lost=scored.lost,
     )
+
+
+def _moments(u: Float[np.ndarray, "robots frames"], there: Bool[np.ndarray, "robots frames"]) -> np.ndarray:
+    """Count the frames of each robot, and sum u and its square over them; shape (robots, 3)."""
+    return np.stack([np.where(there, u**power, 0.0).sum(axis=1) for power in range(3)], axis=1)
+
+
+def _compare(near: np.ndarray, far: np.ndarray) -> tuple[float, float, float, float]:
+    """Give both means, the pooled standard deviation, and Cohen's d; nan without frames of both kinds."""
+    if not (near[0] and far[0]):
+        return (math.nan,) * 4
+    means = near[1] / near[0], far[1] / far[0]
+    squares = sum(some[2] - some[1] ** 2 / some[0] for some in (near, far))
+    spread = math.sqrt(max(squares, 0.0) / (near[0] + far[0]))
+    return float(means[0]), float(means[1]), spread, float((means[0] - means[1]) / max(spread, 1e-9))
 
 
 def _steady(record: simulation.Record) -> Bool[np.ndarray, "robots frames"]:
@@ -95,10 +137,16 @@ def _steady(record: simulation.Record) -> Bool[np.ndarray, "robots frames"]:
     return steady & np.asarray(record.ok)
 
 
+def best(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Find the row at whose velocity the two are furthest apart."""
+    return max(rows, key=lambda row: row["effect"] if math.isfinite(row["effect"]) else -math.inf)
+
+
 @figures.styled
 def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the mean responses with their spread, and how far apart they are; rows as in velocity.json."""
-    velocity, spread, effect = (np.array([row[name] for row in rows]) for name in ("velocity", "spread", "effect"))
+    names = ("velocity", "spread", "effect", "low", "high")
+    velocity, spread, effect, low, high = (np.array([row[name] for row in rows]) for name in names)
     figure = Figure(figsize=(figures.WIDTH, 4.4), layout="constrained")
     means, effects = figure.subplots(2, sharex=True)
     for name, colour in (("obstructed", figures.RIGHT), ("free", figures.LEFT)):
@@ -108,6 +156,7 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
     means.set(ylabel="mean response u")
     means.legend()
     effects.plot(velocity, effect, "o-", color=figures.INK)
+    effects.fill_between(velocity, low, high, color=figures.INK, alpha=0.12, linewidth=0)
     effects.axvspan(*BAND, color=figures.FAINT, alpha=0.5, linewidth=0, label="the paper's best")
     effects.set(xlabel="velocity [0.05 m/s]", ylabel="Cohen's d", xscale="log")
     effects.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
