@@ -47,8 +47,8 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Evaluate, se
 
 def _walk(folder: Path, place: scales.Place, robot: simulation.Params, driver: str, seed: int) -> simulation.Record:
     """Walk one driver of one trial, unless an earlier try did."""
-    finest = driver == "learned" or place.coarse is None
-    eyed = crew.with_eyes(robot, place.eyes if finest else place.coarse)
+    coarse = None if driver == "learned" else place.coarse
+    eyed = crew.with_eyes(robot, coarse or place.eyes)
     seconds = place.seconds or trials.TRIALS[place.trial].seconds
     tried = attempt.tried(eyed, place.trial, driver, place.seeds, seconds)
     return attempt.walk(folder / place.trial / driver, tried, eyed, seed)[1]

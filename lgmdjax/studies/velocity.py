@@ -121,7 +121,7 @@ def _moments(u: Float[np.ndarray, "robots frames"], there: Bool[np.ndarray, "rob
 def _compare(near: np.ndarray, far: np.ndarray) -> tuple[float, float, float, float]:
     """Give both means, the pooled standard deviation, and Cohen's d; nan without frames of both kinds."""
     if not (near[0] and far[0]):
-        return (math.nan,) * 4
+        return math.nan, math.nan, math.nan, math.nan
     means = near[1] / near[0], far[1] / far[0]
     squares = sum(some[2] - some[1] ** 2 / some[0] for some in (near, far))
     spread = math.sqrt(max(squares, 0.0) / (near[0] + far[0]))
