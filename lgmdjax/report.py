@@ -101,7 +101,8 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
     gait, evaluation = read_json(run / "fit-gait/gait.json"), read_json(run / "evaluate/evaluation.json")
     training, calibration = read_json(run / "train/training.json"), read_json(run / "collect/calibration.json")
     rhythm = read_arrays(run / "fit-gait/cpg.npz")
-    studied = {name: read_json(run / f"{name}/{name}.json") for name in STUDIES if name in facts["settings"]}
+    studies = _studies(run, facts["settings"])
+    studied = studies["studied"]
     stages = [{"name": stage, **read_json(run / f"{stage}/done.json")} for stage in (*STAGES, *studied)]
     walked = {place: table for place, table in evaluation.items() if "per_100_m" in next(iter(table.values()))}
     passed = {trial: table for trial, table in evaluation.items() if trial not in walked}
@@ -135,10 +136,7 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "meanings": collisions.KINDS,
         "coarse": _coarse(facts["settings"]),
         "experiments": trials.TRIALS,
-        "studied": studied,
-        "best_velocity": velocity.best(studied["velocity"]) if "velocity" in studied else None,
-        "band": velocity.BAND,
-        "pupils": teaching.pooled(studied.get("teaching", [])),
+        **studies,
         "stages": stages,
         "versions": versions(stages),
         "size": _size(),
@@ -146,6 +144,17 @@ def _contents(run: Path, room: arena.Arena, video_seconds: float) -> dict[str, A
         "looks_at": LOOKS_AT,
         "learners": LEARNERS,
         "nominal": NOMINAL,
+    }
+
+
+def _studies(run: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Read the studies that the run has, and what is told of them beside their figures."""
+    studied = {name: read_json(run / f"{name}/{name}.json") for name in STUDIES if name in settings}
+    return {
+        "studied": studied,
+        "best_velocity": velocity.best(studied["velocity"]) if "velocity" in studied else None,
+        "band": velocity.BAND,
+        "pupils": teaching.pooled(studied.get("teaching", [])),
     }
 
 
