@@ -20,11 +20,11 @@ $(VENV)/.locked: requirements.lock
 	  echo "make: expected Python 3.11 to 3.13, found '$(or $(PYTHON),none)'; install one, or name it: make PYTHON=/path/to/python3" >&2; \
 	  exit 1; }
 	'$(PYTHON)' -m venv --clear '$(VENV)'
-	'$(VENV)/bin/python' -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	'$(VENV)/bin/python' -m pip install --quiet --no-compile --disable-pip-version-check --require-hashes -r requirements.lock
 	@touch '$@'
 
 $(VENV)/.ready: $(VENV)/.locked pyproject.toml
-	'$(VENV)/bin/python' -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	'$(VENV)/bin/python' -m pip install --quiet --no-compile --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch '$@'
 
 reproduce: setup

@@ -4,20 +4,27 @@ Imitation of recorded walks alone leaves a robot that does not turn: while the t
 both eyes, so that "much moves" foretells "turn" in the recorded walks, and a robot that has not begun to turn never
 sees it. The rule is free in simulation, so the navigator's own walks are labelled with it and learned from as well.
 
+How much harder than its teacher the navigator should turn in the end (`training.enliven`) is tried out: collisions are
+too rare to choose by, but how often it comes nearer to something than `TIGHT` tells careless drivers from careful ones.
+
 Source: Ross, Gordon & Bagnell 2011 (DAgger).
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
+import numpy as np
 
-from lgmdjax import drivers, episodes, navigator, scales, simulation, tapes, training
+from lgmdjax import cpg, drivers, episodes, navigator, rollout, scales, scores, simulation, tapes, training
 from lgmdjax.episodes import Walk
 from lgmdjax.stages import crew
 
 OWN_WALKS = 2**19  # number of the first episode that the navigator walks itself: rooms of their own
+TRYOUT = 2**20  # number of the episode whose rooms caution is chosen in
+TIGHT = 0.08  # m of clearance
 KEPT_BACK = 0.25  # share of the rooms that no learner is shown; half of them choose its best epoch, half judge it
 
 
@@ -40,6 +47,37 @@ def practise(
     for number in range(settings.rounds):
         walks = walks + _round(folder, robot, walks, settings, seed, number, variant)
     return walks
+
+
+def tempered(
+    folder: Path, robot: simulation.Params, fit: training.Fit, test: Sequence[Walk], settings: scales.Train, seed: int
+) -> tuple[navigator.Params, list[dict[str, Any]]]:
+    """Choose the caution with which a navigator comes least often too near to something; the least of equals.
+
+    Args:
+        folder: for the walks, one a caution, all in the same rooms. test: stretches of walking to measure its turns on.
+        settings: the cautions, and how many robots walk for how long.
+
+    Returns:
+        The navigator, and a row a caution: whether it is the chosen one, how often it came nearer than `TIGHT`, in how
+        much of a way. Where there is nothing to choose from, nothing is walked.
+    """
+    if not settings.cautions:
+        return training.enliven(fit.best, test), [{"caution": training.CAUTION, "chosen": True}]
+    rooms = rollout.random_rooms(jax.random.fold_in(jax.random.key(seed), TRYOUT), settings.robots)
+    rows, tried = [], []
+    for caution in settings.cautions:
+        tried.append(training.enliven(fit.best, test, caution))
+        pupil = crew.manned(robot, tried[-1])
+        facts = {"caution": caution, "seconds": settings.round_seconds, "robot": crew.digest(pupil)}
+        how = {"seed": seed, "facts": facts, "label": f"caution {caution:g}"}
+        place = folder / "walks" / f"caution-{caution:g}"
+        record = crew.walked(place, pupil, rooms, settings.round_seconds, drivers.LEARNED, **how)
+        score, tight = scores.score(record, cpg.CYCLE_TIME), np.asarray(record.clearance) < TIGHT
+        times = int((tight[:, 1:] & ~tight[:, :-1]).sum())
+        rows.append({"caution": caution, "tight": times, "collisions": score.collisions, "distance": score.distance})
+    least = min(range(len(rows)), key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
+    return tried[least], [row | {"chosen": k == least} for k, row in enumerate(rows)]
 
 
 def practised(folder: Path) -> list[Walk]:
@@ -70,7 +108,7 @@ def _round(
             checkpoints=folder / "checkpoints" / f"round-{number}",
         )
         pupil = crew.manned(robot, training.enliven(fit.best, test))
-        facts = {"settings": asdict(settings), "round": number, "robot": crew.digest(pupil)}
+        facts = {"seconds": settings.round_seconds, "round": number, "robot": crew.digest(pupil)}
         how = {"seed": seed, "facts": facts, "label": f"practice {number + 1} of {settings.rounds}"}
         rooms = crew.rooms_of(seed, OWN_WALKS + number, settings.robots)
         crew.walked(place, pupil, rooms, settings.round_seconds, drivers.LEARNED, **how)

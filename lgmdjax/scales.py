@@ -59,6 +59,7 @@ class Train:
     round_seconds: float  # of each robot
     halves_epochs: int = 80  # of the fit to the teacher's walks in halves, the paper's
     variants: tuple[str, ...] = ("lstm", "lstm-efference", "feed-forward", "mean")
+    cautions: tuple[float, ...] = ()  # to choose from by walking as in a round; none: `training.CAUTION`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,6 +134,26 @@ class Sensitivity:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Stride:
+    """The gait fitted through the body: by each method as many simulated seconds, from `seeds` starts."""
+
+    robot_seconds: float
+    window: float  # s, through which a derivative goes
+    learning_rate: float  # of weights as shares of their size; falls to nothing like half a cosine
+    clip: float  # largest norm of a slope
+    pairs: int  # of tries from which the evolution strategy estimates a slope
+    seeds: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Horizon:
+    """The derivative of a walk against the frames that it goes through, for so many robots."""
+
+    eyes: Eyes
+    robots: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """The page; the video shows one walk."""
 
@@ -175,7 +196,14 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "fit-gait": FitGait(steps=6000, seconds=20),
         "collect": Collect(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
         "train": Train(
-            eyes=_QUICK, epochs=100, rounds=8, round_epochs=60, robots=32, round_seconds=120, halves_epochs=1000
+            eyes=_QUICK,
+            epochs=100,
+            rounds=8,
+            round_epochs=60,
+            robots=32,
+            round_seconds=120,
+            halves_epochs=1000,
+            cautions=(1.5, 2.0, 2.5, 3.0),
         ),
         "evaluate": Evaluate(
             places=(
@@ -202,3 +230,9 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "report": Report(video_seconds=30),
     },
 }
+
+GRADIENTS: Mapping[str, Any] = {
+    "horizon": Horizon(eyes=_SMALL, robots=6),
+    "stride": Stride(robot_seconds=9000.0, window=1.6, learning_rate=5e-3, clip=1.0, pairs=8, seeds=3),
+}
+"""Settings of the studies that fit something by gradient through the walk; they are no stages of a run."""

@@ -11,7 +11,7 @@ not finite, or that fell over, is frozen where it was and flagged by `ok`; nothi
 """
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from lgmdjax import arena, braitenberg, camera, controller, cpg, hexapod, laser,
 from lgmdjax.drivers import Driver, Senses
 
 Leaf = Array | np.ndarray
+Through = Literal["controller", "nerves", "everything"]  # what a derivative passes (`lgmdjax.imitation`)
 FRAME_RATE = 30.0  # Hz, the camera's (paper sec. 3.1)
 SUBSTEPS = 6  # physics steps a frame; the robot's XML has the time step that makes them fill it
 
@@ -140,20 +141,43 @@ def init(params: Params, model: mjx.Model, room: Room, driver: Driver) -> State:
 
 
 def step(
-    params: Params, model: mjx.Model, room: Room, state: State, driver: Driver, draw: Bool[Array, ""] | bool = True
+    params: Params,
+    model: mjx.Model,
+    room: Room,
+    state: State,
+    driver: Driver,
+    draw: Bool[Array, ""] | bool = True,
+    through: Through = "everything",
 ) -> tuple[State, Record]:
     """Run one frame: set back if it touched, sense, decide, move.
 
     Without `draw` the eyes stay shut and see black (u = 0.5): for drivers that do not look, in walks whose pictures
     nobody wants.
+
+    Gradient: by all that `through` names. With "nerves", what the eyes say is held; with "controller", the label and
+    the body too.
     """
     state = set_back(params, room, state, driver)
     scene = arena.at(room.arena, state.frame / FRAME_RATE)
     state, senses = sense(params, scene, state, draw)
+    if through != "everything":
+        state, senses = _eyes_held(state, senses)
     state, label = decide(params, state, senses, driver)
-    moved, clearance = move(params, model, scene, state)
+    walker = (params, state)
+    if through == "controller":
+        label, walker = jax.lax.stop_gradient((label, walker))
+    moved, clearance = move(walker[0], model, scene, walker[1])
+    moved = replace(moved, controller=replace(state.controller, cpg=moved.controller.cpg))
     record = _record(state, senses, label, clearance)
     return _keep_sound(state, moved), record
+
+
+def _eyes_held(state: State, senses: Senses) -> tuple[State, Senses]:
+    """Take what the eyes saw and said for given."""
+    eyes, response = jax.lax.stop_gradient((state.controller.lgmd, state.response))
+    held = replace(state, controller=replace(state.controller, lgmd=eyes), response=response)
+    said = {name: jax.lax.stop_gradient(getattr(senses, name)) for name in ("u", "feed_forward", "excitation")}
+    return held, replace(senses, **said)
 
 
 def set_back(params: Params, room: Room, state: State, driver: Driver) -> State:

@@ -144,7 +144,7 @@ TRIALS = {
             shows="Sixteen obstacles, from (0, 2.5).",
             rooms=lambda key, seeds: rollout.copies(key, scenes.testing_room(), seeds),
             seeds=5,
-            seconds=960.0,
+            seconds=1080.0,
             ends=False,
         ),
         Trial(

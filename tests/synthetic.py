@@ -110,6 +110,26 @@ def rows_of(study: str) -> list[dict]:
         others = [{"place": "white", "contrast": 0.0, "driver": "teacher"} | away]
         corners = [{"place": "corner", "contrast": None, "driver": name} | away for name in ("learned", "eq. 22")]
         return walls + others + corners
+    if study == "stride":
+        walked = {
+            "velocities": [1.0, 2.0],
+            "speed_errors": [1e-3, 2e-3],
+            "pitch_deg": [0.1, 0.2],
+            "roll_deg": [0.1, 0.1],
+        }
+        fits = [
+            {"method": m, "start": 0, "curve": [[28.8, 0.6], [57.6, 0.4]]} | walked for m in ("gradient", "evolution")
+        ]
+        return [{"method": "before", "start": 0, "curve": []} | walked, *fits]
+    if study == "horizon":
+        return [
+            {"contact": contact, "precision": precision, "robot": robot, "horizon": horizon, "norm": 0.1 * horizon}
+            | {"slope": 1.0, "forward": 1.0 + 1e-12, "difference": 1.0 + 1e-8}
+            for contact in ("hard", "soft")
+            for precision in ("float64", "float32")
+            for robot in range(2)
+            for horizon in (1, 15)
+        ]
     axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | rate for v in (0.5, 1.0)]
     return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | rate for k in range(2)]
 

@@ -77,3 +77,29 @@ def test_no_room_is_in_two_of_the_three_parts(recorded):
     parts = [{one.room for one in part} for part in apprentice.split(recorded, seed=3)]
     assert sum(map(len, parts)) == len(set.union(*parts)) == 8
     assert all(parts)
+
+
+def test_caution_is_the_least_of_those_that_come_too_near_least_often(recorded, tmp_path, monkeypatch):
+    """Robots come too near `3, 1, 1` times in as much of a way; nothing is walked where there is no choice."""
+    times = {1.5: 3, 2.0: 1, 2.5: 1}
+
+    def walked(folder, pupil, rooms, seconds, driver, *, facts, **_):
+        clearance = np.full((len(rooms.starts), 600), 0.3)
+        for time in range(times[facts["caution"]]):
+            clearance[0, 100 * (time + 1) : 100 * (time + 1) + 20] = 0.05
+        return walk(len(rooms.starts), frames=600, clearance=clearance)
+
+    monkeypatch.setattr(crew, "walked", walked)
+    monkeypatch.setattr(training, "enliven", lambda params, walks, caution=1.5: replace(params, output_scale=caution))
+    robot, params = simulation.assemble(crew.everyone()), navigator.create(jax.random.key(0))
+    fit = training.Fit(params=params, best=params, train=np.zeros(1), test=np.zeros(1))
+    choice = replace(SETTINGS, cautions=tuple(times))
+    chosen, rows = apprentice.tempered(tmp_path, robot, fit, recorded, choice, seed=0)
+    assert chosen.output_scale == 2.0
+    assert [(row["caution"], row["tight"], row["chosen"]) for row in rows] == [
+        (1.5, 3, False),
+        (2.0, 1, True),
+        (2.5, 1, False),
+    ]
+    chosen, rows = apprentice.tempered(tmp_path, robot, fit, recorded, SETTINGS, seed=0)
+    assert chosen.output_scale == 1.5 and rows == [{"caution": training.CAUTION, "chosen": True}]

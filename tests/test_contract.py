@@ -84,7 +84,7 @@ def driven(driver: drivers.Driver, params: Callable[[], Any], flat: tuple[str, .
 
 # `simulation` has this shape too, but is not here, since MuJoCo's step takes long to compile. Where it is compiled
 # anyway, test_simulation holds that its state can be scanned and that chunks of a crowd are one robot's walk, and
-# test_frame_gradient that reverse and forward mode agree in every parameter of the controller.
+# test_imitation that reverse and forward mode agree in every parameter of the controller.
 COMPONENTS = (
     Component("lgmd", smooth, lgmd.init, lgmd.step, pictures(12, 16)),
     Component(

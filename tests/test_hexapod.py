@@ -322,20 +322,6 @@ def test_robot_that_is_sick_or_fallen_is_not_sound(model):
         assert not hexapod.is_sound(well.replace(qpos=well.qpos.at[2].set(height)))
 
 
-def test_reverse_mode_passes_the_differentiable_solver_and_no_other(model):
-    """Tracing alone tells; `test_simulation` has the numbers."""
-    data, stance = hexapod.reset(model, jnp.zeros(3)), jnp.asarray(hexapod.stance())
-
-    def height(model, targets):
-        return hexapod.substep(model, data, targets).qpos[2]
-
-    gradient = jax.grad(height, argnums=1)
-    for soft in (False, True):
-        assert jax.eval_shape(gradient, hexapod.differentiable(model, soft=soft), stance).shape == (6, 3)
-    with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
-        jax.eval_shape(gradient, model, stance)
-
-
 def kinds(tree) -> list:
     """List shape and type of every leaf; the trees themselves hold arrays that have no truth value when compared."""
     return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,9 +13,23 @@ import pytest
 import synthetic
 from scipy.spatial.transform import Rotation
 
-from lgmdjax import arena, braitenberg, calibration, episodes, figures, hexapod, scales, scores, simulation, trials
+from lgmdjax import (
+    arena,
+    braitenberg,
+    calibration,
+    cpg,
+    episodes,
+    figures,
+    hexapod,
+    navigator,
+    scales,
+    scores,
+    shaping,
+    simulation,
+    trials,
+)
 from lgmdjax.stages import STUDIES, crew
-from lgmdjax.studies import alone, failures, printed, sensitivity, teaching, velocity
+from lgmdjax.studies import alone, failures, horizon, printed, sensitivity, stride, teaching, velocity
 
 EYES = scales.Eyes(width=80, height=60, pooling=3)
 
@@ -198,7 +213,7 @@ def test_a_study_can_be_started_alone(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "study", [velocity, teaching, printed, failures, sensitivity], ids=lambda study: study.__name__
+    "study", [velocity, teaching, printed, failures, sensitivity, stride, horizon], ids=lambda study: study.__name__
 )
 def test_figures_can_be_drawn(study):
     rows = synthetic.rows_of(study.__name__.rpartition(".")[2])
@@ -224,3 +239,42 @@ def test_between_two_pictures_u_stands(robot):
         seen.append(np.asarray(state.response.u))
     changed = [bool(np.any(before != after)) for before, after in pairwise(seen)]
     assert changed == [False, False, True, False, False, True]
+
+
+def test_fitted_legs_start_as_those_that_come_along_and_walk_mirrored():
+    """Turning the rhythm by half a cycle and exchanging the sides' velocities mirrors the targets."""
+    legs = stride.before(shaping.taught())
+    rhythm, networks = stride.parts(legs)
+    jax.tree.map(partial(np.testing.assert_allclose, atol=1e-6), (rhythm, networks), (cpg.Params(), shaping.taught()))
+    changed = replace(
+        legs,
+        networks=jax.tree.map(
+            lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), legs.networks
+        ),
+    )
+    networks = stride.parts(changed)[1]
+    signal = jnp.asarray(np.random.default_rng(3).normal(size=(6, 2)))
+    there = shaping.shape(networks, signal, jnp.asarray([1.3, 0.4]))
+    mirrored = shaping.shape(networks, signal[::-1], jnp.asarray([0.4, 1.3]))
+    np.testing.assert_allclose(mirrored, there[::-1] * np.array([-1.0, 1.0, 1.0]), atol=1e-12)
+
+
+def test_evolution_estimates_the_slope_that_reverse_mode_takes():
+    """Of a quadratic loss, from many pairs."""
+    start = {"a": jnp.asarray([0.3, -0.2, 1.0]), "b": jnp.asarray(0.5)}
+
+    def loss(params, walkers):
+        return jnp.sum((params["a"] - 1) ** 2) + 3 * params["b"] ** 2, walkers
+
+    ask = (lambda x: x, start, jnp.zeros(1), jax.random.key(0))
+    value, exact, _ = stride.METHODS["gradient"](loss, 1)(*ask)
+    tried, estimate, _ = stride.METHODS["evolution"](loss, 20000)(*ask)
+    np.testing.assert_allclose(exact["a"], 2 * (start["a"] - 1))
+    assert tried == pytest.approx(float(value), rel=0.01)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=0.15), estimate, exact)
+
+
+def test_robot_of_the_horizon_has_the_navigator_alone_and_smooth_thresholds(robot):
+    params = horizon.smooth(robot, EYES)
+    assert params.controller.lgmd.smooth and isinstance(params.controller.driver, navigator.Params)
+    assert all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(params.controller))

@@ -50,9 +50,9 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Train, seed:
     minutes = {name: sum(map(len, some)) / FRAME_RATE / 60 for name, some in sets.items()}
     table = training.table({variant: fit.best for variant, fit in fits.items()}, sets)
     lost = sum(not walk.ok[-1] for walk in whole)  # robots that fell, or whose state was not finite
-    result = {"curves": curves, "table": table, "minutes": minutes, "caution": training.CAUTION, "lost": lost}
+    learned, cautions = apprentice.tempered(folder, robot, fits["lstm"], test, settings, seed)
+    result = {"curves": curves, "table": table, "minutes": minutes, "cautions": cautions, "lost": lost}
     write_json(folder / "training.json", result)
-    learned = training.enliven(fits["lstm"].best, test)
     # The eyes that it learned with are those of its own walks, most of what it learned from.
     facts = {"eyes": dataclasses.asdict(settings.eyes), "seed": seed, "training": dataclasses.asdict(settings)}
     navigator.save(folder / "controller.safetensors", learned, header | facts)

@@ -30,7 +30,7 @@ def run(study: str) -> None:
 
 def command(study: str) -> Callable[..., None]:
     """Make the command of a study, for `tyro.cli`."""
-    module, default = import_module(f"lgmdjax.studies.{study}"), scales.SCALES["paper"][study]
+    module, default = import_module(f"lgmdjax.studies.{study}"), {**scales.SCALES["paper"], **scales.GRADIENTS}[study]
 
     def main(settings: Any = default, run: Path | None = None, seed: int = 0, out: Path = Path("runs/studies")) -> None:
         inputs = _inputs(run)

@@ -1,0 +1,175 @@
+"""How far back is a derivative worth taking? The closed-loop imitation loss, against the frames that it goes through.
+
+A robot walks towards a box for `FRAMES` frames, its parameters those of the controller throughout; the loss is that of
+the last frames, and so is the derivative: what the parameters did before does not count. With the number of those
+frames, the horizon, its norm grows as the walk is sensitive to what was done long ago, and what float32 knows of it
+shrinks.
+
+| drawn      | meaning                                                                                        |
+| ---------- | ---------------------------------------------------------------------------------------------- |
+| norm       | of the gradient, in units of the parameters' size, mean over robots; the most and the least    |
+| agreement  | of the slope along a random direction, |a - b| / (|a| + |b|): of reverse and forward mode; of     |
+|            | reverse mode and central differences; of float32 and float64                                   |
+
+Hard contacts are those of the XML, soft ones `hexapod.softened`. Thresholds are smooth.
+
+Writes horizon.json, a row a horizon, contact, precision and robot.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+from mujoco import mjx
+
+from lgmdjax import controller, drivers, figures, files, hexapod, scales, simulation
+from lgmdjax.stages import crew
+
+FRAMES = 150
+HORIZONS = (1, 2, 4, 8, 15, 30, 60, 100, 150)
+STEP = 1e-6  # of central differences, as a share of each parameter's size
+CONTACTS = ("hard", "soft")
+PRECISIONS = ("float64", "float32")
+
+
+def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Horizon, seed: int) -> None:
+    """Take the gradient at every horizon, in rooms of luck, with both kinds of contact and in both precisions."""
+    rows = []
+    for precision in PRECISIONS:
+        with jax.enable_x64(precision == "float64"):
+            robot = smooth(crew.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
+            rooms = crew.rooms_of(seed, 0, settings.robots)
+            models = {"hard": hexapod.build(), "soft": hexapod.softened(hexapod.build())}
+            for contact in CONTACTS:
+                for number in range(settings.robots):
+                    room = jax.tree.map(lambda leaf, number=number: leaf[number], rooms)
+                    found = slopes(robot, models[contact], room, seed, differ=precision == "float64")
+                    facts = {"contact": contact, "precision": precision, "robot": number}
+                    rows += [facts | row for row in found]
+    files.write_json(folder / "horizon.json", rows)
+
+
+def smooth(robot: simulation.Params, eyes: scales.Eyes) -> simulation.Params:
+    """Give a robot steps that can be differentiated, the navigator alone at the wheel."""
+    robot = crew.with_eyes(robot, eyes)
+    nerves, width = robot.controller, 0.3
+    detector = replace(
+        nerves.lgmd,
+        smooth=True,
+        threshold_width=width * jnp.maximum(nerves.lgmd.threshold, 0.1),
+        suppression_width=width * nerves.lgmd.suppression,
+    )
+    nerves = replace(nerves, lgmd=detector, driver=nerves.driver.drivers[drivers.ALL.index(drivers.LEARNED)])
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), replace(robot, controller=nerves))
+
+
+def slopes(
+    robot: simulation.Params, model: mjx.Model, room: simulation.Room, seed: int, differ: bool
+) -> list[dict[str, Any]]:
+    """Walk one robot, and take the derivative at every horizon by three routes."""
+    sizes = jax.tree.map(lambda leaf: jnp.sqrt(jnp.mean(leaf**2)) + 1e-6, robot.controller)
+    keys = jax.random.split(jax.random.key(seed), len(jax.tree.leaves(sizes)))
+    drawn = [
+        jax.random.normal(key, leaf.shape, jnp.float32).astype(leaf.dtype)
+        for key, leaf in zip(keys, jax.tree.leaves(robot.controller), strict=True)
+    ]
+    along = jax.tree.unflatten(jax.tree.structure(robot.controller), drawn)
+    nothing = jax.tree.map(jnp.zeros_like, robot.controller)
+    reverse, forward = _programs()
+    rows = []
+    for horizon in HORIZONS:
+        ask = (robot, model, room, sizes, jnp.asarray(horizon))
+        value, gradient = reverse(nothing, *ask)
+        slope = float(sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient, along))))
+        row = {"horizon": horizon, "loss": float(value), "slope": slope}
+        row["norm"] = float(jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient))))
+        row["forward"] = float(forward(nothing, along, *ask)[1])
+        if differ:
+            ends = [
+                float(forward(jax.tree.map(lambda dx, by=by: by * dx, along), along, *ask)[0]) for by in (STEP, -STEP)
+            ]
+            row["difference"] = (ends[0] - ends[1]) / (2 * STEP)
+        rows.append(row)
+    return rows
+
+
+def _programs():
+    """Compile the loss's gradient and its slope: once for all horizons, which are numbers."""
+    return jax.jit(jax.value_and_grad(loss)), jax.jit(
+        lambda shift, along, *ask: jax.jvp(lambda shift: loss(shift, *ask), (shift,), (along,))
+    )
+
+
+def loss(
+    shift: controller.Params,
+    robot: simulation.Params,
+    model: mjx.Model,
+    room: simulation.Room,
+    sizes: controller.Params,
+    horizon: Array,
+) -> Float[Array, ""]:
+    """Sum up the imitation loss of the last frames, the nerves shifted for as long by shares of their size."""
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def frame(state: simulation.State, number: Array):
+        live = FRAMES - number <= horizon
+        nerves = jax.tree.map(
+            lambda leaf, dx, size: leaf + jnp.where(live, dx, 0.0) * size, robot.controller, shift, sizes
+        )
+        own = replace(robot, controller=nerves)
+        state, record = simulation.step(own, model, room, state, drivers.LEARNED)
+        return state, jnp.where(live, jnp.mean((record.velocity - record.label) ** 2), 0.0)
+
+    start = simulation.init(robot, model, room, drivers.LEARNED)
+    _, errors = jax.lax.scan(frame, start, jnp.arange(FRAMES))
+    return jnp.sum(errors) / horizon
+
+
+@figures.styled
+def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw norm and disagreement against the horizon; rows as in horizon.json."""
+    figure = Figure(figsize=(figures.WIDTH, 2.8), layout="constrained")
+    norm, agreement = figure.subplots(1, 2)
+    colours = {"hard": figures.LEFT, "soft": figures.RIGHT}
+    for contact, colour in colours.items():
+        double, single = (
+            _table([row for row in rows if row["contact"] == contact and row["precision"] == precision])
+            for precision in PRECISIONS
+        )
+        horizons = sorted(double)
+        sizes = np.array([[row["norm"] for row in double[h]] for h in horizons])
+        norm.plot(horizons, np.exp(np.log(sizes).mean(axis=1)), "o-", color=colour, markersize=3, label=contact)
+        norm.fill_between(horizons, sizes.min(axis=1), sizes.max(axis=1), color=colour, alpha=0.15)
+        kinds = {
+            "reverse - forward": ("-", double, "forward"),
+            "reverse - differences": ("--", double, "difference"),
+            "float64 - float32": (":", single, "slope"),
+        }
+        for name, (style, others, other) in kinds.items():
+            apart = [_apart(double[h], others[h], other) for h in horizons]
+            agreement.plot(horizons, apart, style, color=colour, label=name if contact == "hard" else None)
+    norm.set(xscale="log", yscale="log", xlabel="horizon [frames]", ylabel="norm of the gradient")
+    norm.legend()
+    agreement.set(xscale="log", yscale="log", xlabel="horizon [frames]", ylabel="disagreement of the slope")
+    agreement.legend()
+    return figure
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> dict[int, list[Mapping[str, Any]]]:
+    table: dict[int, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        table.setdefault(row["horizon"], []).append(row)
+    return table
+
+
+def _apart(first: Sequence[Mapping[str, Any]], second: Sequence[Mapping[str, Any]], other: str) -> float:
+    """Take the median over robots of |a - b| / (|a| + |b|), a the slope by reverse mode."""
+    pairs = [(a["slope"], b[other]) for a, b in zip(first, second, strict=True)]
+    return float(np.median([abs(a - b) / max(abs(a) + abs(b), 1e-30) for a, b in pairs])) + 1e-17

@@ -1,0 +1,170 @@
+"""The imitation loss of whole frames: its derivative by three routes, what each choice of it holds, and who counts."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from slopes import Routes, along, direction
+
+from lgmdjax import arena, camera, cpg, drivers, hexapod, imitation, lgmd, navigator, rollout, simulation
+
+
+@pytest.fixture(scope="module")
+def params():
+    """A robot that looks and walks, its thresholds smooth, its rhythm in one Runge-Kutta step to compile the less."""
+    return simulation.assemble(
+        navigator.create(jax.random.key(3)),
+        detector=lgmd.Params(threshold=0.5, suppression=30.0, suppression_width=10.0, smooth=True),
+        rhythm=cpg.Params(substeps=1),
+        eyes=camera.Params(width=48, height=36, overlap=0.6),
+    )
+
+
+def before_a_box(ahead: float) -> simulation.Room:
+    """A start with a box to the left, so far ahead [m]."""
+    boxes = arena.place([[ahead, 0.4]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
+    scene = arena.empty_room((5.0, 4.0), boxes=boxes)
+    return simulation.Room(arena=scene, starts=jnp.zeros((1, 3)), key=jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def room():
+    return before_a_box(0.75)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return hexapod.softened(hexapod.build())
+
+
+@pytest.fixture(scope="module")
+def walked(params, room, model):
+    """Ten frames: where they end, what they left behind, and the gradient through the controller alone."""
+    settings = imitation.Settings(frames=10, through="controller")
+    walk = jax.jit(jax.grad(imitation.loss, has_aux=True), static_argnums=5)
+    start = simulation.init(params, model, room, drivers.LEARNED)
+    gradient, (end, record) = walk(params.controller, params, model, room, start, settings)
+    return start, end, record, gradient
+
+
+@pytest.fixture(scope="module")
+def routes(params, model, room, walked):
+    """The error of 15 frames' commands, each frame by its own weight."""
+
+    def told(nerves, weights):
+        settings = imitation.Settings(frames=len(weights))
+        _, (_, record) = imitation.loss(nerves, params, model, room, walked[1], settings)
+        return weights @ jnp.mean((record.velocity - record.label) ** 2, axis=-1)
+
+    return Routes(told)
+
+
+@pytest.mark.slow
+def test_15_frames_through_everything_have_one_derivative_by_three_routes(params, routes):
+    weights = jnp.asarray(np.full(15, 1 / 15))
+    routes.assert_agree(params.controller, weights, step=1e-7)
+    routes.assert_every_leaf_agrees(params.controller, weights)
+
+
+def test_one_whole_frame_has_one_derivative_by_three_routes(params, routes):
+    """From one command to the next: legs, body, eyes, detector and network."""
+    weights = jnp.asarray(np.eye(15)[1])
+    routes.assert_agree(params.controller, weights)
+    routes.assert_every_leaf_agrees(params.controller, weights)
+
+
+def test_through_the_controller_it_is_that_of_imitation_on_what_was_recorded(params, walked):
+    """The navigator alone, shown again the u of the walk, against labels that do not move."""
+    start, _, record, gradient = walked
+
+    def recorded(driver):
+        senses = drivers.Senses(
+            u=record.u,
+            feed_forward=record.feed_forward,
+            excitation=record.excitation,
+            distances=record.distances,
+        )
+        _, velocity = jax.lax.scan(partial(drivers.LEARNED.step, driver), start.controller.driver, senses)
+        return jnp.mean((velocity - record.label) ** 2)
+
+    expected = jax.grad(recorded)(params.controller.driver)
+    assert all(np.any(leaf != 0) for leaf in jax.tree.leaves(expected.weights))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-12), gradient.driver, expected)
+    others = (gradient.lgmd, gradient.cpg, gradient.shaping)
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(others))
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    """The box farther away, where the rule does not ask for all of a turn: its label hangs on every millimetre."""
+    return rollout.stack([before_a_box(1.4)] * 4)
+
+
+SHUT = imitation.Settings(frames=2, draw=False, through="nerves", clip=1e-3)
+
+
+@pytest.fixture(scope="module")
+def crowd(params, model, rooms):
+    """Take the gradient of a crowd of four, their eyes shut: states, nerves -> gradient, states, record."""
+    dealt = jax.jit(lambda states: rollout.deal(lambda same: same, states))  # as those of a walk are
+
+    def run(states, nerves=params.controller):
+        batch = dealt(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+        return imitation.gradient(replace(params, controller=nerves), model, rooms, batch, settings=SHUT)
+
+    return run
+
+
+@pytest.mark.slow
+def test_through_the_nerves_it_is_the_whole_derivative_of_a_robot_with_its_eyes_shut(params, crowd, walked):
+    """By differences; and it reaches the legs: where they carry the robot changes what the rule says.
+
+    Of the detector alone it knows nothing: that still compares its last picture with the dark.
+    """
+    found, _, _ = crowd([walked[1]] * 4)
+    slope = jax.tree.map(lambda leaf: leaf * max(1, found.norms[0] / SHUT.clip), found.slope)
+    tangent, step = direction(params.controller), 1e-6
+    tangent = replace(tangent, lgmd=jax.tree.map(jnp.zeros_like, tangent.lgmd))
+    ends = [
+        crowd([walked[1]] * 4, jax.tree.map(lambda x, dx, by=by: x + by * dx, params.controller, tangent))[0].loss
+        for by in (step, -step)
+    ]
+    np.testing.assert_allclose(along(slope, tangent), (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(slope.lgmd))
+    assert all(np.any(leaf != 0) for leaf in jax.tree.leaves((slope.shaping, slope.cpg.cycle_time)))
+
+
+def test_a_crowd_has_the_mean_gradient_of_those_that_are_sound(crowd, walked):
+    """One of four is sick: it is left out. What is too long is cut, robot by robot."""
+    end = walked[1]
+    ahead = end.data.qpos.at[0].add(0.1)
+    others = [end, replace(end, data=end.data.replace(qpos=ahead)), replace(end, touched=~end.touched)]
+    alone = [crowd([state] * 4)[0] for state in others]
+    assert all(found.norms[0] > SHUT.clip for found in alone)  # all are cut
+    sick = replace(end, data=end.data.replace(qpos=end.data.qpos.at[0].set(jnp.nan)))
+    found, states, record = crowd([others[0], others[1], sick, others[2]])
+    assert found.lost.tolist() == [False, False, True, False]
+    assert record.u.shape == (4, 2, 2) and states.frame[0] == end.frame + 2
+    np.testing.assert_allclose(found.norms[jnp.asarray([0, 1, 3])], [other.norms[0] for other in alone], rtol=1e-8)
+    np.testing.assert_allclose(found.loss, np.mean([other.loss for other in alone]), rtol=1e-10)
+    expected = jax.tree.map(lambda *leaves: sum(leaves) / 3, *[other.slope for other in alone])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-12), found.slope, expected)
+
+
+def test_tuning_changes_the_parts_asked_for_and_tells_of_every_window(params, model, rooms, crowd):
+    """By about the rate, as Adam does; the means and deviations of the data stay."""
+    told = []
+    tuning = imitation.Tuning(windows=2, rooms=2, learning_rate=1e-3, parts=("driver", "cpg"))
+    tuned, rows = imitation.tune(params, model, lambda _: rooms, SHUT, tuning, told.append)
+    assert told == rows and len(rows) == 4
+    assert all(np.isfinite([row["loss"], row["norm"], row["largest"]]).all() and row["lost"] == 0 for row in rows)
+    before, after = params.controller, tuned.controller
+    jax.tree.map(np.testing.assert_array_equal, (before.lgmd, before.shaping), (after.lgmd, after.shaping))
+    for name in ("input_mean", "input_scale", "output_mean", "output_scale"):
+        np.testing.assert_array_equal(getattr(before.driver, name), getattr(after.driver, name))
+    changed = np.abs(after.cpg.cycle_time / before.cpg.cycle_time - 1)
+    assert 0 < changed < 4e-3
+    assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (before.driver, after.driver)), strict=True))
