@@ -49,15 +49,17 @@ SETTLED_ACTIVATION = (0.069216745, 0.069216745)
 SETTLED_ADAPTATION = (0.019520150, 0.116315497)
 
 
-def coupling(within_tripod: float = 0.04, across: float = 0.40) -> Float[Array, "6 6"]:
+def coupling(
+    within_tripod: Float[Array, ""] | float = 0.04, across: Float[Array, ""] | float = 0.40
+) -> Float[Array, "6 6"]:
     """Build W (eqs. 1, 3): weak inhibition inside a tripod, strong across, none of a leg on itself.
 
     The paper prints the two values the other way round, with which no start reaches a tripod (legs of one
     tripod then settle a third of a cycle apart).
     """
     tripod = np.arange(LEGS) % 2
-    W = np.where(tripod[:, None] == tripod, within_tripod, across)
-    return jnp.asarray(W * (1 - np.eye(LEGS)), dtype=float)
+    W = jnp.where(tripod[:, None] == tripod, within_tripod, across)
+    return jnp.where(np.eye(LEGS, dtype=bool), 0.0, W).astype(float)
 
 
 @struct.dataclass(kw_only=True)

@@ -235,4 +235,4 @@ GRADIENTS: Mapping[str, Any] = {
     "horizon": Horizon(eyes=_SMALL, robots=6),
     "stride": Stride(robot_seconds=9000.0, window=1.6, learning_rate=5e-3, clip=1.0, pairs=8, seeds=3),
 }
-"""Settings of the studies that fit something by gradient through the walk; they are no stages of a run."""
+"""Settings of the studies of gradients through the walk; they are no stages of a run."""

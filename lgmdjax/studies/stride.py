@@ -93,7 +93,8 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Stride, seed
             name = folder / f"shaping-{method}-{start}.safetensors"
             shaping.save(name, parts(fitted)[1], {"cycle_time": float(fitted.cycle_time), "seed": seed + start})
             row = {"method": method, "start": start, "curve": curve, "seconds": seconds}
-            rows.append(row | {"rhythm": [float(x) for x in fitted_rhythm(fitted)]} | measure(fitted))
+            numbers = {name: float(getattr(fitted, name)) for name in ("cycle_time", "within", "across")}
+            rows.append(row | numbers | measure(fitted))
     files.write_json(folder / "stride.json", rows)
 
 
@@ -104,15 +105,8 @@ def before(networks: shaping.Params) -> Legs:
     return Legs(networks=networks, cycle_time=rhythm.cycle_time, within=within, across=across)
 
 
-def fitted_rhythm(legs: Legs) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Name the three numbers of the rhythm that are fitted."""
-    return legs.cycle_time, legs.within, legs.across
-
-
 def parts(legs: Legs) -> tuple[cpg.Params, shaping.Params]:
     """Put rhythm and networks together: a mirrored robot walks mirrored."""
-    tripod = jnp.arange(cpg.LEGS) % 2
-    weights = jnp.where(tripod[:, None] == tripod, legs.within, legs.across) * (1 - jnp.eye(cpg.LEGS))
     coxa = jnp.asarray([-1.0, 1.0, 1.0], dtype=float)
     signs = {"w1": 1.0, "b1": 1.0, "w2": coxa, "b2": coxa}
     both = {
@@ -120,7 +114,9 @@ def parts(legs: Legs) -> tuple[cpg.Params, shaping.Params]:
         for name, sign in signs.items()
     }
     rhythm = jax.tree.map(lambda x: jnp.asarray(x, float), cpg.Params())
-    return replace(rhythm, cycle_time=legs.cycle_time, coupling=weights), replace(legs.networks, **both)
+    return replace(rhythm, cycle_time=legs.cycle_time, coupling=cpg.coupling(legs.within, legs.across)), replace(
+        legs.networks, **both
+    )
 
 
 def walk(
