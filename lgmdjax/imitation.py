@@ -19,32 +19,36 @@ threshold does to all that follows.
 
 A window ends where its states are handed on: the next begins in them, without their derivative.
 
-| symbol | name            | unit      | equation |
-| ------ | --------------- | --------- | -------- |
-| v      | record.velocity | nominal   | 17       |
-| v*     | record.label    | nominal   | 22       |
-| L      | loss            | nominal^2 | sec. 5.1 |
+Parameters differ by orders of magnitude, and their slopes by more. A gradient is measured in shares of their sizes,
+which the caller names (`lgmdjax.tuning`).
+
+| symbol | name            | unit                 | equation |
+| ------ | --------------- | -------------------- | -------- |
+| v      | record.velocity | nominal              | 17       |
+| v*     | record.label    | nominal              | 22       |
+| L      | loss            | nominal^2            | sec. 5.1 |
+| -      | slope           | nominal^2 by a share | -        |
 
 Gradient: a robot that is set back starts anew, and what it did before does not count for what comes after. One that
 fell counts no longer. Thresholds that are steps have none (`lgmd.Params.smooth`).
 """
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
-from lgmdjax import controller, drivers, rollout, simulation
+from lgmdjax import controller, drivers, lgmd, rollout, simulation
 from lgmdjax.simulation import Params, Record, Room, State, Through
+
+WIDTH = 0.3  # of a smooth threshold, as a share of it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +58,7 @@ class Settings:
     frames: int = 30
     through: Through = "everything"
     remat: bool = True  # walk each frame again on the way back: its inside need not be kept
-    clip: float = math.inf  # largest norm of one robot's gradient
+    clip: float = math.inf  # largest norm of one robot's gradient, as a multiple of the crowd's middle one
     draw: bool = True  # what the eyes see; else they stay shut
 
 
@@ -63,8 +67,9 @@ class Gradient:
     """What a crowd's window gives."""
 
     loss: Float[Array, ""]  # mean over the robots that count
-    slope: controller.Params  # mean of their gradients, each cut to the largest norm
+    slope: controller.Params  # mean of their gradients, each cut to the largest norm, by shares of the sizes
     norms: Float[Array, " robots"]  # before that
+    noise: Float[Array, ""]  # root of the mean's variance, as its robots differ: its norm by chance alone
     lost: Bool[Array, " robots"]  # whose loss or gradient is not finite: they do not count
 
 
@@ -91,12 +96,16 @@ def loss(
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="states")
 def gradient(
-    params: Params, model: mjx.Model, rooms: Room, states: State, *, settings: Settings
+    params: Params, model: mjx.Model, rooms: Room, states: State, sizes: controller.Params, *, settings: Settings
 ) -> tuple[Gradient, State, Record]:
     """Walk a crowd for a window, each robot in its own room, and take the gradient of its mean loss.
 
     The crowd is dealt out to all devices. A robot whose loss or gradient is not finite is left out of the means,
     and flagged.
+
+    Args:
+        states: from `rollout.start`, or as the last window left them; they are used up.
+        sizes: of the nerves' parameters, in which the gradient is measured; zero for what it leaves out.
     """
     slopes = jax.value_and_grad(loss, has_aux=True)
 
@@ -106,27 +115,30 @@ def gradient(
         )
 
     (losses, (states, record)), each = rollout.deal(share, rooms, states)
+    each = jax.tree.map(jnp.multiply, each, sizes)
     norms: Array = jax.vmap(optax.tree.norm)(each)
     lost = ~(jnp.isfinite(losses) & jnp.isfinite(norms))
     count = jnp.maximum(jnp.sum(~lost), 1)
-    scale = jnp.where(lost, 0.0, jnp.minimum(1.0, settings.clip / jnp.maximum(norms, 1e-30))) / count
+    scale = jnp.where(lost, 0.0, _cut(norms, lost, settings.clip)) / count
 
     def mean(leaf: Float[Array, "robots *shape"]) -> Float[Array, "*shape"]:
         sound = jnp.where(lost.reshape(-1, *[1] * (leaf.ndim - 1)), 0.0, leaf)
         return jnp.tensordot(scale.astype(leaf.dtype), sound, axes=1)
 
-    found = Gradient(loss=jnp.sum(losses, where=~lost) / count, slope=jax.tree.map(mean, each), norms=norms, lost=lost)
+    slope = jax.tree.map(mean, each)
+    # The variance of a mean: what its robots' squares have more than its own.
+    squares = count * jnp.sum((scale * jnp.where(lost, 0.0, norms)) ** 2)
+    noise = jnp.sqrt(jnp.maximum(squares - optax.tree.norm(slope, squared=True), 0.0) / jnp.maximum(count - 1, 1))
+    found = Gradient(loss=jnp.sum(losses, where=~lost) / count, slope=slope, norms=norms, noise=noise, lost=lost)
     return found, states, record
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tuning:
-    """How to follow the gradient."""
-
-    learning_rate: float = 1e-3  # of parameters as shares of their sizes; falls to nothing like half a cosine
-    windows: int = 30  # in a room, before robots go on to others
-    rooms: int = 4  # of each robot, one after the other
-    parts: tuple[str, ...] = ("driver",)  # of `controller.Params` that are tuned
+def _cut(norms: Float[Array, " robots"], lost: Bool[Array, " robots"], clip: float) -> Float[Array, " robots"]:
+    """Scale gradients down that are longer than a multiple of the middle one; those that fell have none."""
+    if math.isinf(clip):
+        return jnp.ones_like(norms)
+    middle = jnp.nan_to_num(jnp.nanmedian(jnp.where(lost | (norms == 0), jnp.nan, norms)))
+    return jnp.minimum(1.0, clip * middle / jnp.maximum(norms, 1e-30))
 
 
 def alone(params: Params) -> Params:
@@ -135,57 +147,6 @@ def alone(params: Params) -> Params:
     return replace(params, controller=replace(params.controller, driver=driver))
 
 
-def tune(
-    params: Params,
-    model: mjx.Model,
-    rooms: Callable[[int], Room],
-    settings: Settings,
-    tuning: Tuning,
-    tell: Callable[[Mapping[str, float]], None] = lambda row: None,
-) -> tuple[Params, list[dict[str, float]]]:
-    """Follow the gradient of the imitation loss (Adam) while the robots walk, window after window.
-
-    Args:
-        params: a robot with the navigator alone at the wheel. rooms: of the crowd, by number.
-        tell: told of every window.
-
-    Returns:
-        The robot, and a row a window: loss, the middle norm of a robot's gradient and the largest one, robots lost.
-    """
-    sizes = _sizes(params.controller, tuning.parts)
-    steps = tuning.windows * tuning.rooms
-    # Slopes differ by many orders of magnitude: what keeps Adam from dividing by zero must be small beside all of them.
-    optimiser = optax.adam(optax.cosine_decay_schedule(tuning.learning_rate, steps), eps=1e-15)
-
-    @jax.jit
-    def update(nerves: controller.Params, state: Any, slope: controller.Params) -> tuple[controller.Params, Any]:
-        scaled = jax.tree.map(jnp.multiply, slope, sizes)
-        changes, state = optimiser.update(scaled, state)
-        return jax.tree.map(lambda leaf, change, size: leaf + change * size, nerves, changes, sizes), state
-
-    nerves: Any = params.controller
-    state, rows = optimiser.init(nerves), []
-    for number in range(tuning.rooms):
-        here = rooms(number)
-        states = rollout.start(params, model, here, driver=drivers.LEARNED)
-        for _ in range(tuning.windows):
-            found, states, _ = gradient(params, model, here, states, settings=settings)
-            # By way of the host: a gradient is laid out over the devices of the crowd, parameters are not.
-            nerves, state = update(params.controller, state, jax.device_get(found.slope))
-            params = replace(params, controller=nerves)
-            norms = np.asarray(found.norms)[~np.asarray(found.lost)]
-            middle, largest = (float(np.quantile(norms, at)) if norms.size else math.nan for at in (0.5, 1.0))
-            row = {"loss": float(found.loss), "norm": middle, "largest": largest, "lost": int(found.lost.sum())}
-            rows.append(row)
-            tell(rows[-1])
-    return params, rows
-
-
-def _sizes(nerves: controller.Params, parts: tuple[str, ...]) -> controller.Params:
-    """Measure each parameter's size, zero where it is not tuned: means and deviations of the data never are."""
-
-    def size(path: Any, leaf: Float[Array, "*shape"]) -> Float[Array, ""]:
-        tuned = path[0].name in parts and not str(path[-1]).strip(".").startswith(("input_", "output_"))
-        return jnp.where(tuned, jnp.sqrt(jnp.mean(leaf**2)) + 1e-3, 0.0)
-
-    return jax.tree_util.tree_map_with_path(size, nerves)
+def smooth(params: Params) -> Params:
+    """Give a robot's detectors steps that have a slope, `WIDTH` wide."""
+    return replace(params, controller=replace(params.controller, lgmd=lgmd.smoothed(params.controller.lgmd, WIDTH)))

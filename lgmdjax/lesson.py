@@ -249,15 +249,6 @@ def _descend_some(loss, networks, state, left, lesson, rate, done, upto, length)
 
 def _both_sides(networks: _Networks, lesson: _Lesson, literal: bool) -> shaping.Params:
     """Undo the scaling of inputs, and give the right legs the left ones' networks with the coxa reversed."""
-
-    def mirrored(left: Float[Array, "3 *layer"], reverse: Float[Array, "*joints"]) -> Float[Array, "6 *layer"]:
-        return jnp.concatenate([left, left[::-1] * reverse])
-
-    same, coxa = jnp.ones(()), jnp.asarray([-1.0, 1.0, 1.0], dtype=float)
-    return shaping.Params(
-        w1=mirrored(networks.w1 / lesson.scale[:, None], same),
-        b1=mirrored(networks.b1, same),
-        w2=mirrored(networks.w2, coxa),
-        b2=mirrored(networks.b2, coxa),
-        literal=literal,
-    )
+    left = networks._replace(w1=networks.w1 / lesson.scale[:, None])
+    twice = {name: jnp.concatenate([weights, weights]) for name, weights in left._asdict().items()}
+    return shaping.symmetric(shaping.Params(**twice, literal=literal))

@@ -37,6 +37,7 @@ With `smooth` both steps are sigmoids of a width in grey levels, which tend to t
 """
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -188,6 +189,15 @@ def _mean_excitation(params: Params, summation: Float[Array, "height width"]) ->
     soft = params.smooth
     passed = S * jax.nn.sigmoid(margin / params.threshold_width) if soft else jnp.where(margin >= 0, S, 0.0)
     return _mean(jnp.abs(passed))
+
+
+def smoothed(params: Params, share: Float[Array, ""] | float) -> Params:
+    """Make sigmoids of both steps, as wide as a share of T_s (of 0.1 grey at least) and of T_f."""
+    widths = {
+        "threshold_width": share * jnp.maximum(params.threshold, 0.1),
+        "suppression_width": share * params.suppression,
+    }
+    return replace(params, smooth=True, **widths)
 
 
 def columns(width: int, overlap: float) -> int:

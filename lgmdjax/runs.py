@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -129,12 +130,19 @@ def _do(run: Run, stage: Stage, print_: str) -> None:
         inputs = {name: run.folder / name for name in stage.inputs}
         stage.work(partial, inputs, run.settings[stage.name], run.seed)
         seconds = time.perf_counter() - began
+        _forget()
         stamp = {"fingerprint": print_, "seconds": round(seconds, 1), "versions": versions.installed()}
         write_json(partial / "done.json", stamp | {"device": device(), "files": _sizes(partial)})
         print(f"{stage.name}: done in {seconds:.0f} s", flush=True)
     if final.exists():
         shutil.rmtree(final)
     os.replace(partial, final)
+
+
+def _forget() -> None:
+    """Let go of a stage's programs: their code is mapped in thousands of pieces, of which Linux allows only so many."""
+    if "jax" in sys.modules:
+        sys.modules["jax"].clear_caches()
 
 
 def device() -> str:

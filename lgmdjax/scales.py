@@ -154,6 +154,36 @@ class Horizon:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Detector:
+    """The LGMD fitted on recorded walks, with its navigator and without, from `seeds` starts."""
+
+    minutes: float  # of walking, drawn again
+    seconds: float  # of each walk: the shorter, the more rooms
+    epochs: int  # of the navigator's own fit, before
+    steps: int  # of the optimiser
+    every: int  # steps from one look at the walks kept back to the next
+    window: int  # frames through which the error goes back
+    streams: int
+    learning_rate: float  # of the detector's constants as shares; falls to nothing like half a cosine
+    navigator_rate: float  # of the navigator's weights, likewise
+    seeds: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedLoop:
+    """The navigator tuned in the closed loop, and practised by DAgger for as long, from `seeds` starts."""
+
+    bench: Bench
+    practice: Train  # rounds of DAgger, each as long as one room of a tune
+    lesson_seconds: float  # of each robot
+    window: int  # frames through which a derivative goes
+    horizons: tuple[int, ...]  # other windows, from the first start; all should go into round_seconds evenly
+    learning_rate: float  # a second of window, as a share of the weights' sizes
+    clip: float  # largest norm of one robot's gradient, as a multiple of the middle one
+    seeds: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """The page; the video shows one walk."""
 
@@ -234,5 +264,27 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
 GRADIENTS: Mapping[str, Any] = {
     "horizon": Horizon(eyes=_SMALL, robots=6),
     "stride": Stride(robot_seconds=9000.0, window=1.6, learning_rate=5e-3, clip=1.0, pairs=8, seeds=3),
+    "detector": Detector(
+        minutes=60.0,
+        seconds=28.0,
+        epochs=60,
+        steps=1000,
+        every=50,
+        window=60,
+        streams=32,
+        learning_rate=1e-2,
+        navigator_rate=1e-3,
+        seeds=3,
+    ),
+    "closed_loop": ClosedLoop(
+        bench=Bench(eyes=_QUICK, robots=16, seconds=90),
+        practice=Train(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=45),
+        lesson_seconds=30,
+        window=15,
+        horizons=(5, 45),
+        learning_rate=6e-3,
+        clip=10.0,
+        seeds=3,
+    ),
 }
 """Settings of the studies of gradients through the walk; they are no stages of a run."""

@@ -17,6 +17,7 @@ Source: Cizek & Faigl, sec. 3.2. The networks are taught by `lgmdjax.lesson.teac
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -39,6 +40,7 @@ SHAPES = {
     "w2": (LEGS, UNITS, JOINTS),
     "b2": (LEGS, JOINTS),
 }
+COXA_REVERSED = np.array([-1.0, 1.0, 1.0])  # joint angles seen in a mirror; legs go round the body, so their order too
 
 
 @struct.dataclass(kw_only=True)
@@ -78,6 +80,18 @@ def shape(params: Params, rhythm: Float[Array, "6 2"], velocity: Float[Array, "2
     inputs = jnp.stack([output, adaptation, jnp.repeat(velocity, LEGS // 2)], axis=1)
     units = jax.nn.relu(jnp.einsum("li,liu->lu", inputs, params.w1) + params.b1)
     return jnp.einsum("lu,luj->lj", units, params.w2) + params.b2
+
+
+def mirror(params: Params) -> Params:
+    """Exchange the networks of left and right: what they give is the mirror image."""
+    signs = {"w1": 1.0, "b1": 1.0, "w2": COXA_REVERSED, "b2": COXA_REVERSED}
+    return replace(params, **{name: getattr(params, name)[::-1] * sign for name, sign in signs.items()})
+
+
+def symmetric(params: Params) -> Params:
+    """Give the right legs the left ones' networks, mirrored: a mirrored rhythm and command give mirrored targets."""
+    left = LEGS // 2
+    return jax.tree.map(lambda own, image: jnp.concatenate([own[:left], image[left:]]), params, mirror(params))
 
 
 def save(path: Path | str, params: Params, metadata: Mapping[str, object] | None = None) -> None:

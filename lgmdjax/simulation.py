@@ -131,7 +131,7 @@ def init(params: Params, model: mjx.Model, room: Room, driver: Driver) -> State:
         data=hexapod.reset(model, room.starts[0]),
         controller=controller.init(params.controller, dark, driver, room.key),
         teacher=braitenberg.init(params.teacher),
-        response=lgmd.Response(u=jnp.full(2, lgmd.STILL), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2)),
+        response=lgmd.Response(u=jnp.full(2, lgmd.STILL, float), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2)),
         frame=jnp.asarray(0, jnp.int32),
         setbacks=jnp.asarray(0, jnp.int32),
         fresh=jnp.asarray(True),

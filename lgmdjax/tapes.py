@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from lgmdjax.episodes import Walk
 from lgmdjax.errors import InputError
@@ -13,13 +13,13 @@ from lgmdjax.errors import InputError
 
 @struct.dataclass(kw_only=True)
 class Tape:
-    """Frames to learn from, by window, frame in the window, and stream."""
+    """Frames to learn from, by window (unless it is one of them), frame in the window, and stream."""
 
-    u: Float[Array, "windows frames streams 2"]
-    label: Float[Array, "windows frames streams 2"]
-    last: Float[Array, "windows frames streams 2"]  # velocity of the frame before
-    fresh: Bool[Array, "windows frames streams"]  # nothing is remembered from before this frame
-    counts: Float[Array, "windows frames streams"]  # 1, or 0 where the tape is padded
+    u: Float[Array, "*windows frames streams 2"]
+    label: Float[Array, "*windows frames streams 2"]
+    last: Float[Array, "*windows frames streams 2"]  # velocity of the frame before
+    fresh: Bool[Array, "*windows frames streams"]  # nothing is remembered from before this frame
+    counts: Float[Array, "*windows frames streams"]  # 1, or 0 where the tape is padded
 
 
 def halve(walks: Sequence[Walk]) -> tuple[list[Walk], list[Walk]]:
@@ -53,20 +53,25 @@ def lay(walks: Sequence[Walk], first: Float[np.ndarray, "2"], *, streams: int, w
     u, label = (np.concatenate([getattr(walk, name) for walk in walks]) for name in ("u", "label"))
     last = np.concatenate([np.concatenate([first[None], walk.velocity[:-1]]) for walk in walks])
     fresh = np.concatenate([np.arange(len(walk)) == 0 for walk in walks])
-    frames = len(fresh)
-    windows = max(1, round(frames / (streams * window)))
-    length = -(-frames // (streams * windows))
 
-    def cut(values: np.ndarray) -> np.ndarray:
-        padding = streams * windows * length - frames
-        values = np.pad(values, ((0, padding), *((0, 0),) * (values.ndim - 1)))
-        values = np.moveaxis(values.reshape(streams, windows, length, *values.shape[1:]), 0, 2)
+    def both(values: np.ndarray) -> np.ndarray:
+        values = cut(values, streams=streams, window=window)
         if not mirrored:
             return values
         swapped = values[..., ::-1] if values.ndim == 4 else values
         return np.concatenate([values, swapped], axis=2)
 
-    fresh = cut(fresh)
+    counts, fresh = np.ones(len(fresh)), both(fresh)
     fresh[0, 0] = True
-    u, label, last, counts = (jnp.asarray(cut(x), dtype=float) for x in (u, label, last, np.ones(frames)))
+    u, label, last, counts = (jnp.asarray(both(x), dtype=float) for x in (u, label, last, counts))
     return Tape(u=u, label=label, last=last, fresh=jnp.asarray(fresh), counts=counts)
+
+
+def cut(values: Shaped[np.ndarray, "all *shape"], *, streams: int, window: int) -> np.ndarray:
+    """Cut a series into streams of windows, axes (window, frame, stream, ...), as `lay` does, filled up with zeros."""
+    frames = len(values)
+    windows = max(1, round(frames / (streams * window)))
+    length = -(-frames // (streams * windows))
+    padding = streams * windows * length - frames
+    values = np.pad(values, ((0, padding), *((0, 0),) * (values.ndim - 1)))
+    return np.moveaxis(values.reshape(streams, windows, length, *values.shape[1:]), 0, 2)

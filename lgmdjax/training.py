@@ -227,7 +227,7 @@ def _epoch(params: navigator.Params, progress: Progress, train: Tape, test: Tape
 
     def window(carry: tuple[Any, Any, navigator.State], tape: Tape):
         weights, memory, states = carry
-        loss = jax.value_and_grad(partial(_window_error, params, told=settings.told), has_aux=True)
+        loss = jax.value_and_grad(partial(window_error, params, told=settings.told), has_aux=True)
         (_, (squares, states)), gradient = loss(weights, states, tape)
         updates, memory = optimiser.update(gradient, memory)
         return (optax.apply_updates(weights, updates), memory, states), squares
@@ -246,7 +246,7 @@ def _epoch(params: navigator.Params, progress: Progress, train: Tape, test: Tape
     )
 
 
-def _window_error(
+def window_error(
     params: navigator.Params, weights: Any, states: navigator.State, tape: Tape, *, told: bool
 ) -> tuple[Array, tuple[Array, navigator.State]]:
     """Walk one window; return its MSE, and its sum of squares and the states at its end."""
@@ -269,7 +269,7 @@ def _tape_error(params: navigator.Params, tape: Tape) -> Float[Array, ""]:
     """Walk a tape without learning, and return its MSE."""
 
     def window(states: navigator.State, tape: Tape) -> tuple[navigator.State, Array]:
-        _, (squares, states) = _window_error(params, params.weights, states, tape, told=False)
+        _, (squares, states) = window_error(params, params.weights, states, tape, told=False)
         return states, squares
 
     _, squares = jax.lax.scan(window, _states(params, tape), tape)

@@ -94,7 +94,7 @@ def rows_of(study: str) -> list[dict]:
     if study == "velocity":
         row = {"obstructed": 0.6, "free": 0.55, "spread": 0.02}
         return [
-            row | {"velocity": v, "effect": v, "low": v - 0.1, "high": v + 0.1, "speed": 0.05 * v}
+            row | {"velocity": v, "effect": v, "as_good": v > 1, "low": v - 0.1, "high": v + 0.1, "speed": 0.05 * v}
             for v in (0.1, 1.0, 5.0)
         ]
     if study == "teaching":

@@ -79,6 +79,17 @@ def test_no_room_is_in_two_of_the_three_parts(recorded):
     assert all(parts)
 
 
+def test_an_approach_lasts_until_the_robot_was_twice_as_far():
+    """Three robots: one sways over the bound, one comes back after it was free, one is put down anew in between."""
+    clearance = np.full((3, 60), 0.12)
+    clearance[0, 10:40:2] = 0.05
+    clearance[1, [10, 30]], clearance[1, 20] = 0.05, 0.3
+    clearance[2, [10, 30]] = 0.05
+    fresh = np.zeros((3, 60), bool)
+    fresh[2, 20] = True
+    assert apprentice.approaches(walk(3, frames=60, clearance=clearance, fresh=fresh)) == 1 + 2 + 2
+
+
 def test_caution_is_the_least_of_those_that_come_too_near_least_often(recorded, tmp_path, monkeypatch):
     """Robots come too near `3, 1, 1` times in as much of a way; nothing is walked where there is no choice."""
     times = {1.5: 3, 2.0: 1, 2.5: 1}

@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom, in a kernel of its own and in single precision, as a user runs it."""
+"""Every notebook runs from top to bottom, in a kernel of its own and the precision that it sets, as a user runs it."""
 
 from pathlib import Path
 

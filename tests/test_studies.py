@@ -1,6 +1,7 @@
 """The studies: what they change, what they count, and their figures, on walks and rows made up."""
 
 import json
+import math
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import pairwise
@@ -21,11 +22,11 @@ from lgmdjax import (
     episodes,
     figures,
     hexapod,
-    navigator,
     scales,
     scores,
     shaping,
     simulation,
+    strides,
     trials,
 )
 from lgmdjax.stages import STUDIES, crew
@@ -58,17 +59,23 @@ def test_velocity_tells_obstructed_frames_from_free_ones():
     noise = np.repeat(generator.normal(0, 0.02, (4, 60, 1)), 25, axis=1)
     u = np.where(distance < 1, 0.6, 0.5)[None, :, None] + noise
     changed = replace(record, u=np.repeat(u, 2, axis=-1))
-    row = velocity.measure(1.5, changed, np.broadcast_to(distance, (4, 1500)), suppression=1.0)
+    row, effects = velocity.measure(1.5, changed, np.broadcast_to(distance, (4, 1500)), suppression=1.0)
     assert row.obstructed == pytest.approx(0.6, abs=0.01) and row.free == pytest.approx(0.5, abs=0.01)
     assert row.effect == pytest.approx(0.1 / row.spread, rel=0.15)
     assert row.low < row.effect < row.high and row.high - row.low < 0.2 * row.effect
     assert row.speed == pytest.approx(0.05, rel=0.1)  # what is left of the sway counts as way
     assert row.silenced == 0
+    worse, one = replace(row, velocity=3.0, effect=0.9 * row.effect), replace(row, velocity=5.0, effect=math.nan)
+    told = velocity.compared([(row, effects), (worse, 0.9 * effects), (one, np.full_like(effects, np.nan))])
+    assert [each.as_good for each in told] == [True, False, False]
+    noisy = effects + generator.normal(0, 0.1 * row.effect, len(effects))
+    assert [each.as_good for each in velocity.compared([(worse, noisy), (row, effects)])] == [True, True]
 
 
 def test_velocity_without_frames_of_both_kinds_has_no_effect_and_is_not_the_best():
     record = synthetic.walk(robots=2, frames=300)
-    blank = velocity.measure(0.1, record, np.full((2, 300), 3.0), suppression=1.0)
+    blank, effects = velocity.measure(0.1, record, np.full((2, 300), 3.0), suppression=1.0)
+    assert velocity.compared([(blank, effects)]) == [blank]
     assert np.isnan(blank.effect) and np.isnan(blank.low) and blank.frames[0] == 0 < blank.frames[1]
     rows = [asdict(blank), asdict(blank) | {"velocity": 1.2, "effect": 0.4}]
     assert velocity.best(rows)["velocity"] == 1.2
@@ -243,8 +250,8 @@ def test_between_two_pictures_u_stands(robot):
 
 def test_fitted_legs_start_as_those_that_come_along_and_walk_mirrored():
     """Turning the rhythm by half a cycle and exchanging the sides' velocities mirrors the targets."""
-    legs = stride.before(shaping.taught())
-    rhythm, networks = stride.parts(legs)
+    legs = strides.before(shaping.taught())
+    rhythm, networks = strides.parts(legs)
     jax.tree.map(partial(np.testing.assert_allclose, atol=1e-6), (rhythm, networks), (cpg.Params(), shaping.taught()))
     changed = replace(
         legs,
@@ -252,7 +259,7 @@ def test_fitted_legs_start_as_those_that_come_along_and_walk_mirrored():
             lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)).reshape(leaf.shape), legs.networks
         ),
     )
-    networks = stride.parts(changed)[1]
+    networks = strides.parts(changed)[1]
     signal = jnp.asarray(np.random.default_rng(3).normal(size=(6, 2)))
     there = shaping.shape(networks, signal, jnp.asarray([1.3, 0.4]))
     mirrored = shaping.shape(networks, signal[::-1], jnp.asarray([0.4, 1.3]))
@@ -260,21 +267,33 @@ def test_fitted_legs_start_as_those_that_come_along_and_walk_mirrored():
 
 
 def test_evolution_estimates_the_slope_that_reverse_mode_takes():
-    """Of a quadratic loss, from many pairs."""
+    """Of quadratic losses of four robots, from many pairs; a robot whose loss is not finite does not count."""
     start = {"a": jnp.asarray([0.3, -0.2, 1.0]), "b": jnp.asarray(0.5)}
+    goals = jnp.asarray([1.0, 0.5, 1.5, jnp.nan])
 
-    def loss(params, walkers):
-        return jnp.sum((params["a"] - 1) ** 2) + 3 * params["b"] ** 2, walkers
+    def loss(params, goal):
+        return jnp.sum((params["a"] - goal) ** 2) + 3 * params["b"] ** 2, 2 * goal
 
-    ask = (lambda x: x, start, jnp.zeros(1), jax.random.key(0))
-    value, exact, _ = stride.METHODS["gradient"](loss, 1)(*ask)
-    tried, estimate, _ = stride.METHODS["evolution"](loss, 20000)(*ask)
+    value, exact, ends = stride.METHODS["gradient"](loss, 1)(start, goals, jax.random.key(0))
+    tried, estimate, same = stride.METHODS["evolution"](loss, 20000)(start, goals, jax.random.key(0))
     np.testing.assert_allclose(exact["a"], 2 * (start["a"] - 1))
+    np.testing.assert_allclose(ends, 2 * goals)
+    np.testing.assert_allclose(same, 2 * goals)
     assert tried == pytest.approx(float(value), rel=0.01)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=0.15), estimate, exact)
 
 
-def test_robot_of_the_horizon_has_the_navigator_alone_and_smooth_thresholds(robot):
-    params = horizon.smooth(robot, EYES)
-    assert params.controller.lgmd.smooth and isinstance(params.controller.driver, navigator.Params)
-    assert all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(params.controller))
+def test_a_window_is_measured_whatever_the_phase_of_its_gait():
+    """A robot that goes along a heading of 0.5 rad with a speed that swings by half, and turns at 0.1 rad/s."""
+    speed, turn, cycle, steps = 0.05, 0.1, 0.8, 288
+    measured = []
+    for phase in (0.0, 1.3, 2.9):
+        time = np.arange(steps + 1) / 180
+        swing = 4 * np.pi / cycle  # twice a cycle
+        along = speed * (time - 0.5 / swing * np.cos(swing * time + phase))
+        yaw = 0.5 + turn * (time - time[-1] / 2) + 0.02 * np.sin(swing / 2 * time + phase)
+        way = np.stack([along * np.cos(0.5), along * np.sin(0.5)], axis=1)
+        tilt = 0.01 * np.stack([np.sin(swing * time[1:]), np.cos(swing * time[1:])], axis=1)
+        course = strides.measured(*map(jnp.asarray, (way, yaw, tilt, np.full((steps, 18), 0.3))))
+        measured.append((float(course.speed), float(course.turn), float(course.sway), float(course.effort)))
+    np.testing.assert_allclose(measured, [(speed, turn, 0.01, 0.3)] * 3, rtol=0.02)

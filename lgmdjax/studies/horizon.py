@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 from mujoco import mjx
 
-from lgmdjax import controller, drivers, figures, files, hexapod, scales, simulation
+from lgmdjax import controller, drivers, figures, files, hexapod, imitation, scales, simulation
 from lgmdjax.stages import crew
 
 FRAMES = 150
@@ -44,7 +44,8 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Horizon, see
     rows = []
     for precision in PRECISIONS:
         with jax.enable_x64(precision == "float64"):
-            robot = smooth(crew.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
+            robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
+            robot = imitation.smooth(imitation.alone(robot))
             rooms = crew.rooms_of(seed, 0, settings.robots)
             models = {"hard": hexapod.build(), "soft": hexapod.softened(hexapod.build())}
             for contact in CONTACTS:
@@ -54,20 +55,6 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Horizon, see
                     facts = {"contact": contact, "precision": precision, "robot": number}
                     rows += [facts | row for row in found]
     files.write_json(folder / "horizon.json", rows)
-
-
-def smooth(robot: simulation.Params, eyes: scales.Eyes) -> simulation.Params:
-    """Give a robot steps that can be differentiated, the navigator alone at the wheel."""
-    robot = crew.with_eyes(robot, eyes)
-    nerves, width = robot.controller, 0.3
-    detector = replace(
-        nerves.lgmd,
-        smooth=True,
-        threshold_width=width * jnp.maximum(nerves.lgmd.threshold, 0.1),
-        suppression_width=width * nerves.lgmd.suppression,
-    )
-    nerves = replace(nerves, lgmd=detector, driver=nerves.driver.drivers[drivers.ALL.index(drivers.LEARNED)])
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), replace(robot, controller=nerves))
 
 
 def slopes(

@@ -21,6 +21,8 @@ Writes sensitivity.json, a row a value: axis, value, whether it is the chosen on
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -65,17 +67,20 @@ AXES = {
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity, seed: int) -> None:
     """Score the robot with every change, and every pupil."""
     robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
-    recorded = _recorded(inputs)  # before hours of walking
+    recorded = recorded_by(inputs)  # before hours of walking
     frames = sum(map(len, episodes.stretches(recorded)))
     rows, chosen = [], settled(robot, settings.bench.eyes)
-    for axis, value, changed, contrast in changes(robot, settings.bench.eyes):
-        rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
+    for _, same in groupby(changes(robot, settings.bench.eyes), key=itemgetter(0)):
+        for axis, value, changed, contrast in same:
+            rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
+        jax.clear_caches()  # of programs for other eyes: Linux lets a process hold the code of about ten walks
     for axis, value, walks in lessons(recorded, seed):
         epochs = fair(settings.epochs, frames, sum(map(len, walks)))
         for start in range(settings.seeds):
             place = folder / "pupils" / f"{axis}-{value:g}-{start}"
             pupil = crew.manned(robot, _fit(place, walks, epochs, seed + start))
             rows.append(_score(folder, pupil, settings.bench, seed, axis, value, start=start))
+        jax.clear_caches()
     rows = [row | {"chosen": row["value"] == chosen.get(row["axis"])} for row in rows]
     files.write_json(folder / "sensitivity.json", rows)
 
@@ -166,7 +171,7 @@ def _evenly(stretches: Sequence[Walk], frames: int, generator: np.random.Generat
     return chosen
 
 
-def _recorded(inputs: Mapping[str, Path]) -> list[Walk]:
+def recorded_by(inputs: Mapping[str, Path]) -> list[Walk]:
     """Read all that the run recorded: the teacher's walks and the navigator's own."""
     if "collect" not in inputs:
         raise InputError("expected a run whose walks pupils can learn from, got none; name one with --run")

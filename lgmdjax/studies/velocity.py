@@ -4,7 +4,8 @@ A robot that looks at nothing walks straight on through random rooms at 0.1 to 5
 each. A frame counts as obstructed when something stands within `NEAR` of the laser in a sector straight ahead, as free
 when nothing does within `FAR`; the mean response of both eyes, averaged over about a gait cycle, is compared between
 the two. Where they are furthest apart in standard deviations (Cohen's d), the detector tells best whether the way is
-free. Intervals are bootstrapped over robots: frames of one walk are alike.
+free. Intervals are bootstrapped over robots: frames of one walk are alike. Rooms differ much more than velocities do,
+so velocities are compared in the same ones: one is as good as the best unless it is worse in 97.5 % of the resamples.
 
 Writes velocity.json, a row a velocity, and the walks.
 
@@ -13,7 +14,7 @@ Source: Cizek & Faigl, sec. 4.2 and fig. 9.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ class Row:
     effect: float  # Cohen's d
     low: float  # of its 95 % interval
     high: float
+    as_good: bool  # as the best velocity, as far as these rooms can tell
     frames: tuple[int, int]  # obstructed, free
     silenced: float  # share of the frames in which the gate was shut
     lost: int  # robots that fell
@@ -55,7 +57,7 @@ class Row:
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Velocity, seed: int) -> None:
     """Walk at every velocity through the same rooms, and compare."""
     robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
-    rows = []
+    measured = []
     for velocity in settings.velocities:
         seconds = max(settings.metres / (velocity * float(gait.Gait().nominal_velocity)), LEAST)
         bench = scales.Bench(eyes=settings.eyes, robots=settings.robots, seconds=seconds)
@@ -64,8 +66,8 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Velocity, se
             label=f"v = {velocity:g}", draw=True,
         )  # fmt: skip
         free = ahead(crew.bench_rooms(bench, seed).arena, record)
-        rows.append(measure(velocity, record, free, float(robot.controller.lgmd.suppression)))
-    files.write_json(folder / "velocity.json", [asdict(row) for row in rows])
+        measured.append(measure(velocity, record, free, float(robot.controller.lgmd.suppression)))
+    files.write_json(folder / "velocity.json", [asdict(row) for row in compared(measured)])
 
 
 def at_velocity(robot: simulation.Params, velocity: float) -> simulation.Params:
@@ -88,17 +90,17 @@ def ahead(rooms: arena.Arena, record: simulation.Record) -> Float[np.ndarray, "r
 
 def measure(
     velocity: float, record: simulation.Record, ahead: Float[np.ndarray, "robots frames"], suppression: float
-) -> Row:
-    """Compare u where something is near ahead with u where nothing is."""
+) -> tuple[Row, Float[np.ndarray, " resamples"]]:
+    """Compare u where something is near ahead with u where nothing is; give d of the resamples too."""
     u = ndimage.uniform_filter1d(np.asarray(record.u).mean(axis=-1), WINDOW, axis=1)
     steady = _steady(record)
     near, far = (_moments(u, steady & there) for there in (ahead < NEAR, ahead > FAR))
     obstructed, free, spread, effect = _compare(near.sum(axis=0), far.sum(axis=0))
     chosen = np.random.default_rng(0).integers(0, len(u), (RESAMPLED, len(u)))
-    effects = [_compare(near[some].sum(axis=0), far[some].sum(axis=0))[-1] for some in chosen]
+    effects = np.array([_compare(near[some].sum(axis=0), far[some].sum(axis=0))[-1] for some in chosen])
     low, high = np.nanpercentile(effects, (2.5, 97.5)) if np.any(np.isfinite(effects)) else (math.nan, math.nan)
     scored, silenced = scores.score(record, cpg.CYCLE_TIME), np.asarray(record.feed_forward)[steady] > suppression
-    return Row(
+    row = Row(
         velocity=velocity,
         speed=scored.speed,
         obstructed=obstructed,
@@ -107,10 +109,23 @@ def measure(
         effect=effect,
         low=float(low),
         high=float(high),
+        as_good=False,
         frames=(int(near[:, 0].sum()), int(far[:, 0].sum())),
         silenced=float(silenced.mean()) if silenced.size else math.nan,
         lost=scored.lost,
     )
+    return row, effects
+
+
+def compared(measured: Sequence[tuple[Row, Float[np.ndarray, " resamples"]]]) -> list[Row]:
+    """Tell which velocities are as good as the best; resamples of all are of the same robots, hence the same rooms."""
+    rows, effects = [row for row, _ in measured], np.array([effects for _, effects in measured])
+    sound = np.isfinite([row.effect for row in rows])
+    if not sound.any():
+        return rows
+    first = int(np.argmax(np.where(sound, [row.effect for row in rows], -math.inf)))
+    worse = np.mean(effects < effects[first], axis=1)  # a resample without frames of both kinds is for none
+    return [replace(row, as_good=bool(ok and share < 0.975)) for row, ok, share in zip(rows, sound, worse, strict=True)]
 
 
 def _moments(u: Float[np.ndarray, "robots frames"], there: Bool[np.ndarray, "robots frames"]) -> np.ndarray:
@@ -155,7 +170,9 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
         means.fill_between(velocity, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
     means.set(ylabel="mean response u")
     means.legend()
-    effects.plot(velocity, effect, "o-", color=figures.INK)
+    good = np.array([row["as_good"] for row in rows])
+    effects.plot(velocity, effect, "o-", color=figures.INK, markerfacecolor="white", label="worse than the best")
+    effects.plot(velocity[good], effect[good], "o", color=figures.INK, label="as good as the best")
     effects.fill_between(velocity, low, high, color=figures.INK, alpha=0.12, linewidth=0)
     effects.axvspan(*BAND, color=figures.FAINT, alpha=0.5, linewidth=0, label="the paper's best")
     effects.set(xlabel="velocity [0.05 m/s]", ylabel="Cohen's d", xscale="log")
