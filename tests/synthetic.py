@@ -130,8 +130,9 @@ def rows_of(study: str) -> list[dict]:
             for robot in range(2)
             for horizon in (1, 15)
         ]
-    axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | rate for v in (0.5, 1.0)]
-    return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | rate for k in range(2)]
+    row = rate | {"speed": 0.05}
+    axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | row for v in (0.5, 1.0)]
+    return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | row for k in range(2)]
 
 
 def write_experiments(run: Path) -> Path:

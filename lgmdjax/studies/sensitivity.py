@@ -29,6 +29,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lgmdjax import apprentice, cpg, drivers, episodes, figures, files, navigator, scales, scores, simulation, training
@@ -197,27 +198,45 @@ def _score(
 
 @figures.styled
 def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw collisions per 100 m against every axis, with intervals; the chosen value is ringed."""
+    """Draw collisions per 100 m against every axis, with intervals, and the speed; the chosen value is ringed."""
     axes_of = [axis for axis in AXES if any(row["axis"] == axis for row in rows)]
     figure = Figure(figsize=(figures.WIDTH, 0.4 + 1.75 * ((len(axes_of) + 1) // 2)), layout="constrained")
     panels = np.ravel(figure.subplots((len(axes_of) + 1) // 2, 2, sharey=True))
-    for panel, axis in zip(panels, axes_of, strict=False):
+    for number, (panel, axis) in enumerate(zip(panels, axes_of, strict=False)):
         some = [row for row in rows if row["axis"] == axis]
-        values = np.array([row["value"] for row in some], float)
-        rates = np.array([[row["per_100_m"][key] for key in ("value", "low", "high")] for row in some])
-        positions = {value: place for place, value in enumerate(sorted(set(values)))}
-        x = np.array([positions[value] for value in values]) + 0.12 * np.array([row.get("start", 0) for row in some])
-        panel.vlines(x, rates[:, 1], rates[:, 2], color=figures.LEFT, alpha=0.45, linewidth=1.6)
-        beyond = rates[:, 0] > MOST
-        panel.plot(x[~beyond], rates[~beyond, 0], "o", color=figures.LEFT, markersize=4, clip_on=False, zorder=3)
-        panel.plot(x[beyond], np.full(beyond.sum(), MOST), "^", color=figures.LEFT, markersize=5, clip_on=False)
-        ringed = np.array([row["chosen"] for row in some])
-        panel.plot(x[ringed], rates[ringed, 0], "o", markersize=9, markerfacecolor="none", color=figures.INK)
+        positions = {value: place for place, value in enumerate(sorted({row["value"] for row in some}))}
+        x = np.array([positions[row["value"]] + 0.12 * row.get("start", 0) for row in some])
+        _speeds(panel, x, some, labelled=number % 2 == 1)
+        _rates(panel, x, some)
         panel.set_xticks(list(positions.values()), [f"{value:.3g}" for value in positions])
         panel.set(xlabel=AXES[axis])
         panel.grid(False, axis="x")
     for panel in panels[len(axes_of) :]:
         panel.remove()
     panels[0].set_ylim(0, min(panels[0].get_ylim()[1], MOST))
-    figure.supylabel("collisions per 100 m", fontsize=8.5)
+    figure.supylabel("collisions per 100 m", fontsize=8.5, color=figures.LEFT)
     return figure
+
+
+def _rates(panel: Axes, x: np.ndarray, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Draw rates with their intervals; arrows stand for more than fits."""
+    rates = np.array([[row["per_100_m"][key] for key in ("value", "low", "high")] for row in rows])
+    style = {"color": figures.LEFT, "clip_on": False, "zorder": 3}
+    panel.vlines(x, rates[:, 1], rates[:, 2], color=figures.LEFT, alpha=0.45, linewidth=1.6)
+    for there, marker in ((rates[:, 0] <= MOST, "o"), (rates[:, 0] > MOST, "^")):
+        if there.any():  # the layout has no place for a line without points
+            panel.plot(x[there], np.minimum(rates[there, 0], MOST), marker, markersize=4, **style)
+    ringed = np.array([row["chosen"] for row in rows])
+    if ringed.any():
+        panel.plot(
+            x[ringed], rates[ringed, 0], "o", markersize=9, markerfacecolor="none", color=figures.INK, clip_on=False
+        )
+
+
+def _speeds(panel: Axes, x: np.ndarray, rows: Sequence[Mapping[str, Any]], *, labelled: bool) -> None:
+    """Draw the speed behind: a robot that turns all the time touches nothing, and gets nowhere."""
+    speeds = panel.twinx()
+    speeds.plot(x, [100 * row["speed"] for row in rows], "_", color=figures.INK, markersize=9, alpha=0.6)
+    speeds.set(ylim=(0, 10), ylabel="speed [cm/s]" if labelled else "")
+    speeds.tick_params(right=labelled, labelright=labelled)
+    speeds.grid(False)
