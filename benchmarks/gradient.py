@@ -8,7 +8,7 @@ frame, are the walk, its loss and nothing else; `imitation.gradient`, which walk
 the middle of the crowds takes the shorter ones too. Memory is what XLA sets aside for a program's own use.
 
 Beside it what one would do without reverse mode: a slope in one direction by forward mode, and differences to both
-sides of every number that can be tuned. These are not run: a difference is two walks, and walks are timed.
+sides of every number that can be tuned, which are not run: each is two walks, and walks are timed.
 
 Every program is compiled in a process of its own, with a cache that is empty before, and run there. The gradient of the
 longest window is then compiled once more by another process, which finds it in the cache.
@@ -188,9 +188,13 @@ def main(robots: tuple[int, ...] = (1, 16, 64), frames: tuple[int, ...] = (1, 30
     forward = apart(replace(case, kind="forward mode"))
     differences = 2 * walk.tunable * walk.run
     print(f"asked: a gradient for {ASKED:g} walks\n\n{case.robots} robots, {case.frames} frames, in walks:")
-    print(f"  the gradient, of {walk.tunable} numbers     {remat.run / walk.run:9.2f}")
-    print(f"  forward mode, in one direction  {forward.run / walk.run:9.2f}")
-    print(f"  differences, for the gradient   {differences / walk.run:9.0f}, {differences / remat.run:.0f} gradients\n")
+    for name, spent in (
+        (f"gradient, of {walk.tunable} numbers", remat.run),
+        ("forward mode, in one direction", forward.run),
+        ("differences, for the gradient", differences),
+    ):
+        print(f"  {name:30s}  {spent / walk.run:9.2f}  {spent / remat.run:8.2f} gradients")
+    print()
     for name, cost, asked in (("cold", remat, ASKED_COLD), ("from the cache", again, ASKED_WARM)):
         seconds = f"{cost.trace + cost.compile:.0f} s ({cost.trace:.0f} s of them tracing)"
         print(f"gradient compiled {name}: {seconds}; asked: {asked:g} s")

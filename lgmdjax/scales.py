@@ -278,11 +278,11 @@ GRADIENTS: Mapping[str, Any] = {
     ),
     "closed_loop": ClosedLoop(
         bench=Bench(eyes=_QUICK, robots=16, seconds=90),
-        practice=Train(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=45),
+        practice=Train(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=30),
         lesson_seconds=30,
         window=15,
         horizons=(5, 45),
-        learning_rate=6e-3,
+        learning_rate=1e-2,
         clip=10.0,
         seeds=3,
     ),

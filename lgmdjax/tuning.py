@@ -93,7 +93,9 @@ def tune(
 
     @jax.jit
     def update(nerves: controller.Params, state: Any, slope: controller.Params) -> tuple[controller.Params, Any]:
-        changes, state = optimiser.update(tied(slope), state)
+        both: Any = tied(slope)
+        changes: Any
+        changes, state = optimiser.update(both, state)
         return moved(nerves, changes, whole), state
 
     def practise(done: Progress, here: Room) -> Progress:
@@ -111,8 +113,8 @@ def tune(
         return Progress(nerves=nerves, optimiser=state, rooms=done.rooms + 1, rows=filled)
 
     nothing = jnp.full((steps, len(Row._fields)), jnp.nan)
-    start = optimiser.init(params.controller)
-    done = Progress(nerves=params.controller, optimiser=start, rooms=jnp.asarray(0, jnp.int32), rows=nothing)
+    nerves: Any = params.controller
+    done = Progress(nerves=nerves, optimiser=optimiser.init(nerves), rooms=jnp.asarray(0, jnp.int32), rows=nothing)
     done = done if saved is None else saved.latest(done)
     for number in range(int(done.rooms), settings.rooms):
         done = practise(done, rooms(number))

@@ -4,6 +4,7 @@ import shutil
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -184,11 +185,12 @@ def tune(params, model, rooms, crowd, tmp_path):
 
 def test_tuning_changes_the_parts_asked_for_and_tells_of_every_window(params, tune):
     """By about the rate, as Adam does; the means and deviations of the data stay; all in one program."""
-    programs = imitation.gradient._cache_size()
+    program: Any = imitation.gradient
+    before = program._cache_size()
     tuned, rows, told = tune()
     assert told == rows and len(rows) == 4 and np.isfinite(rows).all()
     assert all(row.lost == row.fallen == row.touches == 0 < row.norm <= row.largest for row in rows)
-    assert imitation.gradient._cache_size() == max(programs, 1)
+    assert program._cache_size() == max(before, 1)
     before, after = params.controller, tuned.controller
     jax.tree.map(np.testing.assert_array_equal, (before.lgmd, before.shaping), (after.lgmd, after.shaping))
     for name in ("input_mean", "input_scale", "output_mean", "output_scale"):

@@ -29,7 +29,7 @@ from lgmdjax import (
 from lgmdjax.errors import InputError
 from lgmdjax.files import read_arrays
 
-DATA = Path(__file__).parent.parent / "data"
+DATA = Path(__file__).parent.parent / "data" / "trained"  # gait and controller of one run: each learned with the other
 
 
 def eyes(settings: scales.Eyes) -> camera.Params:

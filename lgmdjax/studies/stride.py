@@ -26,6 +26,7 @@ Writes stride.json (a row a method and start), and shaping-<method>-<start>.safe
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -146,7 +147,7 @@ def going_on(tasks: Task, ends: Walker, began: Task) -> Task:
     def one(end: Walker, anew: Walker) -> Walker:
         return jax.tree.map(partial(jnp.where, hexapod.is_sound(end.data)), end, anew)
 
-    return tasks.replace(walker=jax.vmap(one)(ends, began.walker))
+    return replace(tasks, walker=jax.vmap(one)(ends, began.walker))
 
 
 def _reverse(loss: Callable, _: int) -> Callable:
