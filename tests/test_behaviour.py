@@ -19,7 +19,7 @@ SECONDS = 30.0
 def beside(key: jax.Array, lateral: float) -> arena.Arena:
     """A box of 0.5 m a side, 1 m ahead and so far to the left."""
     box = arena.place([[1.25, lateral]], [[0.25, 0.25]], [0.8])
-    return scenes.textured(arena.empty_room((6.0, 6.0), boxes=box), key)
+    return scenes.textured(arena.empty_room((10.0, 10.0), boxes=box), key)
 
 
 TEXTURES = 3
@@ -103,6 +103,6 @@ def test_turns_away_from_what_is_on_its_side_and_mirrors_when_mirrored(walks, ki
 def test_passes_what_is_not_in_its_way(walks):
     """A box far to the side does not stop it: more often than not it comes abreast of where the box begins.
 
-    Not always: it is a cautious robot, that looks at walls as well.
+    Not always: it is a cautious robot, and walls 5 m off are not nothing to it.
     """
     assert np.mean(walks["learned"].position[of_kind("box far to the left"), ..., 0].max(axis=-1) > 1.0) > 0.5
