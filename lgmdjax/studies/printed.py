@@ -52,7 +52,10 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Printed, see
         geometry = legs.geometry(hexapod.load())
         networks = lesson.teach(geometry, key=jax.random.key(seed), steps=STEPS, literal=True)
         shaping.save(literal, networks, {"steps": STEPS, "seed": seed})
-    rows = [_measure(folder, name, change(robot, folder), settings, seed) for name, change in CASES.items()]
+    rows = []
+    for name, change in CASES.items():
+        rows.append(_measure(folder, name, change(robot, folder), settings, seed))
+        jax.clear_caches()  # nearly every case has a program of its own (see `lgmdjax.runs`)
     files.write_json(folder / "printed.json", rows)
 
 

@@ -79,6 +79,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Teaching, se
             pupil = teach(place, under(robot, case.rule), case.variant, settings, seed + number)
             facts = {"rule": case.rule, "variant": case.variant, "start": number}
             rows.append(_score(place / "bench", pupil, settings, drivers.LEARNED, seed, **facts))
+        jax.clear_caches()  # of a start's fits and walks, two dozen programs (see `lgmdjax.runs`)
     files.write_json(folder / "teaching.json", rows)
 
 

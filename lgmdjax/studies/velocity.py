@@ -120,12 +120,12 @@ def measure(
 def compared(measured: Sequence[tuple[Row, Float[np.ndarray, " resamples"]]]) -> list[Row]:
     """Tell which velocities are as good as the best; resamples of all are of the same robots, hence the same rooms."""
     rows, effects = [row for row, _ in measured], np.array([effects for _, effects in measured])
-    sound = np.isfinite([row.effect for row in rows])
-    if not sound.any():
-        return rows
-    first = int(np.argmax(np.where(sound, [row.effect for row in rows], -math.inf)))
+    first = _furthest([row.effect for row in rows])
     worse = np.mean(effects < effects[first], axis=1)  # a resample without frames of both kinds is for none
-    return [replace(row, as_good=bool(ok and share < 0.975)) for row, ok, share in zip(rows, sound, worse, strict=True)]
+    return [
+        replace(row, as_good=math.isfinite(row.effect) and bool(share < 0.975))
+        for row, share in zip(rows, worse, strict=True)
+    ]
 
 
 def _moments(u: Float[np.ndarray, "robots frames"], there: Bool[np.ndarray, "robots frames"]) -> np.ndarray:
@@ -154,7 +154,11 @@ def _steady(record: simulation.Record) -> Bool[np.ndarray, "robots frames"]:
 
 def best(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     """Find the row at whose velocity the two are furthest apart."""
-    return max(rows, key=lambda row: row["effect"] if math.isfinite(row["effect"]) else -math.inf)
+    return rows[_furthest([row["effect"] for row in rows])]
+
+
+def _furthest(effects: Sequence[float]) -> int:
+    return int(np.argmax(np.where(np.isfinite(effects), effects, -math.inf)))
 
 
 @figures.styled
