@@ -1,8 +1,8 @@
 """Train the robot that comes with the package: `python experiments/train_controller.py` (an hour, two cores).
 
 It is that of `lgmdjax train --scale paper --seed 2026`, put where `lgmdjax trial` finds it, with the gait that it
-learned on: on another one, taught alike, it turned from a tube in 2 of 6 walks, on its own in 12 of 12. Interrupted, the
-same command carries on.
+learned on: on another one, taught alike, it turned from a tube in 2 of 6 walks, on its own in 12 of 12. Interrupted,
+the same command carries on.
 """
 
 import shutil
