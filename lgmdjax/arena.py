@@ -32,7 +32,6 @@ from lgmdjax.prisms import (
     distance_to_boxes,
     distance_to_cylinders,
     is_parked,
-    join,
     mirrored,
     moved,
     parked,
@@ -54,9 +53,9 @@ __all__ = [
     "is_parked",
     "margins",
     "mirror",
-    "nearest",
     "parked",
     "place",
+    "tangents",
     "validate",
     "walls",
 ]
@@ -140,43 +139,48 @@ def clearance(
     overhead cannot be touched; the floor does not count. Of the ends (x, y) is enough.
     Gradient: that of the nearest feature; zero where a cylinder's axis cuts a capsule's.
     """
+    return jnp.min(_distances(arena, starts[..., :2], ends[..., :2]), axis=-1) - radii
+
+
+def tangents(
+    arena: Arena, starts: Float[Array, "s axes"], ends: Float[Array, "s axes"]
+) -> tuple[Float[Array, "s 2"], Float[Array, " s"]]:
+    """Find for each plane segment the line n . x = c that parts it from the obstacle or wall nearest to it.
+
+    With d(t) the signed distance of that thing from the segment shifted by t, n = dd/dt at t = 0, which is of length 1,
+    and c = min(n . p, n . q) - d(0), p and q the ends. All of the thing lies at n . x <= c, since it is convex. n is
+    along x where a cylinder's axis lies on the segment.
+
+    Gradient: that of the nearest feature.
+
+    Returns:
+        n and c [m].
+    """
     p, q = starts[..., :2], ends[..., :2]
+    nearest = jnp.argmin(_distances(arena, p, q), axis=-1, keepdims=True)
+
+    def apart(shift: Float[Array, "s 2"]) -> tuple[Float[Array, ""], Float[Array, " s"]]:
+        distances = jnp.take_along_axis(_distances(arena, p + shift, q + shift), nearest, axis=-1)[..., 0]
+        return jnp.sum(distances), distances
+
+    normals, distances = jax.grad(apart, has_aux=True)(jnp.zeros_like(p))
+    ahead = jnp.asarray([1.0, 0.0], normals.dtype)
+    normals = jnp.where(jnp.any(normals != 0, axis=-1, keepdims=True), normals, ahead)
+    support = jnp.minimum(jnp.sum(normals * p, axis=-1), jnp.sum(normals * q, axis=-1))
+    return normals, support - distances
+
+
+def _distances(arena: Arena, p: Float[Array, "s 2"], q: Float[Array, "s 2"]) -> Float[Array, "s n"]:
+    """Measure the signed distances [m] of plane segments to every box, cylinder and wall; infinite if overhead."""
     low, high = arena.room[0::2], arena.room[1::2]
-    to_walls = jnp.minimum(jnp.minimum(p, q) - low, high - jnp.maximum(p, q))
-    hits = [_to_boxes(arena.boxes, p, q), _to_cylinders(arena.cylinders, p, q), to_walls]
-    return jnp.min(jnp.concatenate(hits, axis=-1), axis=-1) - radii
-
-
-def _to_boxes(boxes: Prisms, p: Array, q: Array) -> Array:
-    return jnp.where(is_overhead(boxes), jnp.inf, distance_to_boxes(boxes, p, q))
-
-
-def _to_cylinders(cylinders: Prisms, p: Array, q: Array) -> Array:
-    return jnp.where(is_overhead(cylinders), jnp.inf, distance_to_cylinders(cylinders, p, q))
+    boxes = jnp.where(is_overhead(arena.boxes), jnp.inf, distance_to_boxes(arena.boxes, p, q))
+    cylinders = jnp.where(is_overhead(arena.cylinders), jnp.inf, distance_to_cylinders(arena.cylinders, p, q))
+    return jnp.concatenate([boxes, cylinders, jnp.minimum(p, q) - low, high - jnp.maximum(p, q)], axis=-1)
 
 
 def is_overhead(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
     """Tell which prisms hang above the robot."""
     return prisms.bottom >= ROBOT_HEIGHT
-
-
-def nearest(arena: Arena, starts: Float[Array, "s axes"], ends: Float[Array, "s axes"]) -> tuple[Prisms, Prisms]:
-    """Pick what the physics must know of: for each plane segment the nearest box, walls among them, and cylinder.
-
-    Both have an entry a segment. Where a room has none, or it hangs overhead, they are parked or overhead ones.
-    Gradient: through the prisms picked.
-    """
-    p, q = starts[..., :2], ends[..., :2]
-    solid = join(arena.boxes, walls(arena))
-    return (
-        _least(solid, _to_boxes(solid, p, q)),
-        _least(arena.cylinders, _to_cylinders(arena.cylinders, p, q)),
-    )
-
-
-def _least(prisms: Prisms, distances: Float[Array, "s n"]) -> Prisms:
-    chosen = jnp.argmin(distances, axis=-1)
-    return jax.tree.map(lambda leaf: leaf[chosen], prisms)
 
 
 def walls(arena: Arena, thickness: float = 1.0) -> Prisms:

@@ -2,8 +2,8 @@
 
 `mjcf/hexapod.xml` is the home of every mass, length, limit and gain; this module turns its names into static
 indices and reads poses out of `mjx.Data`. The `mjx.Model` is an argument everywhere, so that robots in rooms
-of their own are a `vmap`: the physics has a box and a cylinder for the trunk and for each leg, which
-`place_obstacles` moves to what is nearest. More would cost: in MJX every pair that may touch is computed in each step.
+of their own are a `vmap`: the physics has a plane for each shape that collides, which `place_obstacles` puts before
+what is nearest. More would cost: in MJX every pair that may touch is computed in each step.
 
 | symbol  | name                                              | unit               |
 | ------- | ------------------------------------------------- | ------------------ |
@@ -32,12 +32,10 @@ from lgmdjax.errors import InputError
 
 LEGS = ("left_front", "left_middle", "left_rear", "right_rear", "right_middle", "right_front")
 JOINTS = ("coxa", "femur", "tibia")
-PARTS = ("trunk", *LEGS)  # what has obstacle slots of its own
 EYES = ("eye_left", "eye_right")
 CAPSULES = ("bumper", *(f"{leg}_{part}" for leg in LEGS for part in JOINTS[1:]))  # what collides, in capsules' order
 LOWEST, HIGHEST = 0.04, 0.30  # m; where the trunk of a robot on its feet can be
 LEAST_UPRIGHT = 0.7  # cosine of the trunk's tilt; below it (45 degrees) the robot has fallen
-ASIDE = 100.0  # m, the height at which a slot is out of the way
 
 
 @struct.dataclass(kw_only=True)
@@ -56,9 +54,7 @@ class _Anatomy(NamedTuple):
     laser: np.ndarray  # (3,) m, in the trunk's frame
     capsules: np.ndarray  # (13,) geoms that collide with obstacles
     feet: np.ndarray  # (6,) geoms that stand on the floor
-    boxes: np.ndarray  # (7,) obstacle slots, one for each of PARTS
-    cylinders: np.ndarray  # (7,)
-    reach: np.ndarray  # (2, 7, 3) m, both ends of PARTS in the trunk's frame: bumper, and hip to foot in stance
+    barriers: np.ndarray  # (13,) planes, one for each of the capsules
 
 
 def xml_path() -> Path:
@@ -110,26 +106,18 @@ def softened(model: mjx.Model) -> mjx.Model:
 @cache
 def _anatomy() -> _Anatomy:
     model = load()
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key("stance").id)
-    mujoco.mj_kinematics(model, data)
 
     def geoms(names: list[str]) -> np.ndarray:
         # Of 32 bits in either precision: JAX remembers of an array of 64 the precision in which it met it first.
         return np.array([model.geom(name).id for name in names], dtype=np.int32)
 
-    nose = model.geom("bumper").size[1] * np.array([1.0, 0.0, 0.0])
-    hips = [data.joint(f"{leg}_coxa").xanchor for leg in LEGS] - data.body("trunk").xpos
-    soles = [data.geom(f"{leg}_foot").xpos for leg in LEGS] - data.body("trunk").xpos
     return _Anatomy(
         stance=model.key("stance").qpos.copy(),
         eyes=np.stack([model.site(name).pos for name in EYES]),
         laser=model.site("laser").pos.copy(),
         capsules=geoms([*CAPSULES]),
         feet=geoms([f"{leg}_foot" for leg in LEGS]),
-        boxes=geoms([f"slot_box_{part}" for part in PARTS]),
-        cylinders=geoms([f"slot_cylinder_{part}" for part in PARTS]),
-        reach=np.stack([[-nose, *hips], [nose, *soles]]),
+        barriers=geoms([f"before_{name}" for name in CAPSULES]),
     )
 
 
@@ -182,32 +170,27 @@ def substep(model: mjx.Model, data: mjx.Data, targets: Float[Array, "6 3"]) -> m
         return implicit.step(model, data.replace(ctrl=targets.reshape(18).astype(data.ctrl.dtype)))
 
 
-def place_obstacles(model: mjx.Model, room: arena.Arena, pose: Pose) -> mjx.Model:
-    """Move the obstacle slots of trunk and legs to the box, walls among them, and the cylinder nearest to each.
+def place_obstacles(model: mjx.Model, room: arena.Arena, data: mjx.Data) -> mjx.Model:
+    """Put a barrier between each shape that collides and what is nearest to it where the robot stands.
 
-    Legs are taken as they stand, from hip to foot. Of two boxes that a part would touch at once, as the walls of a
-    corner, it knows the nearer one only. A cylinder is a capsule whose caps reach beyond its ends: into the floor,
-    and above the robot. What hangs overhead is put aside.
+    A barrier is an upright plane that touches the nearest obstacle or wall (`arena.tangents`): it is as far off as
+    that, and holds as long as the robot has moved little, as in a frame. Of two things that a shape would touch at
+    once, as the walls of a corner, it knows the nearer one only.
+
+    Gradient: through where and how the planes stand.
     """
-    slots = _anatomy()
-    starts, ends = pose.position + slots.reach.astype(pose.position.dtype) @ rotation(pose).T
-    boxes, cylinders = arena.nearest(room, starts, ends)
-    ids = np.concatenate([slots.boxes, slots.cylinders])
-    kept = ("centre", "half_size", "yaw", "bottom", "top")
-    both = {name: jnp.concatenate([getattr(boxes, name), getattr(cylinders, name)]) for name in kept}
-    overhead = jnp.concatenate([arena.is_overhead(boxes), arena.is_overhead(cylinders)])
-    middle = jnp.where(overhead, ASIDE, (both["top"] + both["bottom"]) / 2)
-    half_height = (both["top"] - both["bottom"]) / 2
-    half_turn, zero = both["yaw"] / 2, jnp.zeros_like(both["yaw"])
-    # MuJoCo wants (x, y, z) half sizes of a box, (radius, half length) of a capsule.
-    length = jnp.where(np.isin(ids, slots.cylinders), half_height, both["half_size"][:, 1])
-    position = jnp.column_stack([both["centre"], middle])
-    size = jnp.column_stack([both["half_size"][:, 0], length, half_height])
-    quaternion = jnp.column_stack([jnp.cos(half_turn), zero, zero, jnp.sin(half_turn)])
+    with jax.numpy_dtype_promotion("standard"):
+        starts, ends, _ = capsules(model, mjx.kinematics(model, data))
+    normals, offsets = arena.tangents(room, starts, ends)
+    x, y = normals.T
+    zero = jnp.zeros_like(x)
+    # The quarter turn about (-y, x, 0) that takes a plane's own normal, z, to (x, y, 0).
+    turn = jnp.sqrt(0.5) * jnp.stack([zero + 1, -y, x, zero], axis=1)
+    position = jnp.stack([offsets * x, offsets * y, zero], axis=1)
+    ids = _anatomy().barriers
     return model.replace(
         geom_pos=model.geom_pos.at[ids].set(position.astype(model.geom_pos.dtype)),
-        geom_size=model.geom_size.at[ids].set(size.astype(model.geom_size.dtype)),
-        geom_quat=model.geom_quat.at[ids].set(quaternion.astype(model.geom_quat.dtype)),
+        geom_quat=model.geom_quat.at[ids].set(turn.astype(model.geom_quat.dtype)),
     )
 
 

@@ -243,7 +243,7 @@ def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tupl
 
 def move(params: Params, model: mjx.Model, scene: arena.Arena, state: State) -> tuple[State, Float[Array, ""]]:
     """Run rhythm, servos and body to the next frame; return the least clearance [m] on the way."""
-    model = hexapod.place_obstacles(model, scene, hexapod.pose(state.data))
+    model = hexapod.place_obstacles(model, scene, state.data)
     interval = 1 / (FRAME_RATE * SUBSTEPS)
 
     def substep(carry, _):

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from reference import arena as reference
+from slopes import assert_three_ways_agree
 
 from lgmdjax import arena, scenes
 from lgmdjax.errors import InputError
@@ -25,7 +26,7 @@ clearance = jax.jit(arena.clearance)
 margins = jax.jit(arena.margins, static_argnames="ahead")
 random_rooms = jax.jit(jax.vmap(scenes.random_room, in_axes=(0, None)))
 free_poses = jax.jit(arena.free_poses, static_argnames="count")
-nearest = jax.jit(arena.nearest)
+tangents = jax.jit(arena.tangents)
 KEYS = jax.random.split(jax.random.key(0), 32)
 
 
@@ -152,40 +153,62 @@ def test_clearance_grows_as_fast_as_the_robot_backs_off() -> None:
     np.testing.assert_allclose(slope, [-np.sqrt(0.5), -np.sqrt(0.5), 0.0], atol=1e-12)
 
 
-def test_nearest_knows_walls_and_leaves_out_what_hangs_overhead() -> None:
+def test_tangents_know_walls_and_leave_out_what_hangs_overhead() -> None:
     room = scenes.indoor_scene()
     starts, ends = jnp.asarray([[0.6, 1.2], [0.6, 2.0]]), jnp.asarray([[0.7, 1.2], [0.6, 2.8]])
-    boxes, cylinders = nearest(room, starts, ends)
-    # The table's top would be the nearest to the first; the box ahead comes next. The other ends by the wall.
-    np.testing.assert_allclose(boxes.centre, [[1.4, 0.0], [0.0, 3.5]])
-    np.testing.assert_allclose(boxes.top, [0.6, float(room.wall_height)])
-    np.testing.assert_allclose(cylinders.centre, [[0.4, 1.05], [0.4, 1.85]])
+    normals, offsets = tangents(room, starts, ends)
+    # The table's top would be the nearest to both; one of its legs comes next to the first. The other ends by the wall.
+    np.testing.assert_allclose(normals, [[0.8, 0.6], [0.0, -1.0]], atol=1e-12)
+    np.testing.assert_allclose(offsets, [0.8 * 0.4 + 0.6 * 1.05 + 0.025, -3.0], atol=1e-12)
 
 
-def test_nearest_holds_what_each_segment_would_touch_first() -> None:
-    """What physics knows of is as near as what the room has, wherever the robot stands."""
-    room = scenes.testing_room()
+def farthest(room: arena.Arena, normal: np.ndarray) -> np.ndarray:
+    """Tell how far each thing of a room reaches in a direction: corners of boxes, rims of cylinders, walls' faces."""
+    inward = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    reaches = np.where(inward @ normal > 1 - 1e-9, room.room * [1, -1, 1, -1], np.inf).tolist()
+    for row in np.flatnonzero(~arena.is_parked(room.boxes)):
+        c, s = np.cos(room.boxes.yaw[row]), np.sin(room.boxes.yaw[row])
+        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * room.boxes.half_size[row] @ [[c, s], [-s, c]]
+        reaches.append(np.max((room.boxes.centre[row] + corners) @ normal))
+    for row in np.flatnonzero(~arena.is_parked(room.cylinders)):
+        reaches.append(room.cylinders.centre[row] @ normal + room.cylinders.half_size[row, 0])
+    return np.array(reaches)
+
+
+def test_tangents_part_each_segment_from_what_it_would_touch_first() -> None:
+    """Wherever it lies, in an obstacle too: they touch one thing, from which the segment is as far as from the line."""
+    room = jax.tree.map(np.asarray, scenes.testing_room())
     rng = np.random.default_rng(2)
     starts = rng.uniform(-3.8, 3.8, (200, 2))
     ends = starts + rng.uniform(-0.15, 0.15, (200, 2))
-    boxes, cylinders = nearest(room, jnp.asarray(starts), jnp.asarray(ends))
-    assert count(boxes) == count(cylinders) == 200
-    room, boxes, cylinders = jax.tree.map(np.asarray, (room, boxes, cylinders))
-    open_field = dataclasses.replace(room, room=np.array([-99.0, 99.0, -99.0, 99.0]))
-    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        line = reference.segment(start, end)
-        picked = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], prisms) for prisms in (boxes, cylinders)]
-        few = dataclasses.replace(open_field, boxes=picked[0], cylinders=picked[1])
-        there = reference.point_to_room(room, line).min()
-        # Of two that the segment cuts either will do.
-        known = reference.point_to_room(few, line).min()
-        assert known == pytest.approx(there, abs=1e-6) or max(known, there) < 0
+    normals, offsets = map(np.asarray, tangents(room, jnp.asarray(starts), jnp.asarray(ends)))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    for start, end, normal, offset in zip(starts, ends, normals, offsets, strict=True):
+        assert np.abs(farthest(room, normal) - offset).min() < 1e-9
+        there = reference.point_to_room(room, reference.segment(start, end)).min()
+        known = min(normal @ start, normal @ end) - offset
+        assert known == pytest.approx(there, abs=1e-5) or max(known, there) < 0
 
 
-def test_nearest_gives_a_parked_cylinder_where_there_is_none() -> None:
-    boxes, cylinders = nearest(arena.empty_room(), jnp.zeros((6, 2)), jnp.ones((6, 2)))
-    assert count(boxes) == 6
-    assert count(cylinders) == 0
+def test_of_two_things_equally_near_the_tangent_is_of_one() -> None:
+    """In the middle between walls, and on the diagonal of a corner."""
+    at = jnp.asarray([[0.0, 0.0], [2.5, 2.5]])
+    normals, offsets = tangents(arena.empty_room((6.0, 6.0)), at, at)
+    np.testing.assert_allclose(np.abs(normals).max(axis=1), 1.0)
+    np.testing.assert_allclose(offsets, [-3.0, -3.0])
+
+
+def test_tangents_turn_and_move_with_the_segment_as_differences_say() -> None:
+    """Before a corner of a box and before a cylinder, about which the line turns."""
+    boxes, pole = arena.place([[1.0, 0.0]], 0.2, 1.0, yaw=0.3), arena.place([[0.0, 1.0]], 0.2, 1.0)
+    room = arena.empty_room((9.0, 9.0), boxes=boxes, cylinders=pole)
+
+    def told(segments):
+        normals, offsets = arena.tangents(room, *segments)
+        return jnp.sum(jnp.sin(offsets)) + jnp.sum(jnp.cos(normals + offsets[:, None]))
+
+    segments = jnp.asarray([[[0.6, 0.35], [-0.1, 0.5]], [[0.7, 0.5], [0.2, 0.6]]])
+    assert_three_ways_agree(told, segments)
 
 
 @pytest.mark.parametrize(("time", "x"), [(0.0, 1.0), (2.0, 1.0), (3.0, 2.0), (4.0, 3.0), (9.0, 3.0)])

@@ -10,18 +10,10 @@ COXA, FEMUR, TIBIA = 0.052, 0.066, 0.133
 
 
 def twin(model: mujoco.MjModel, placed) -> mujoco.MjModel:
-    """Give C MuJoCo the shapes that an `mjx.Model` has been given, with the bounds that its broad phase needs."""
-    for name in ("geom_pos", "geom_size", "geom_quat"):
+    """Give C MuJoCo the barriers that an `mjx.Model` has been given."""
+    for name in ("geom_pos", "geom_quat"):
         getattr(model, name)[:] = np.asarray(getattr(placed, name))
-    for i in range(model.ngeom):
-        half = model.geom_size[i].copy()
-        if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE:
-            half = np.array([half[0], half[0], half[0] + half[1]])
-        elif model.geom_type[i] != mujoco.mjtGeom.mjGEOM_BOX:
-            continue
-        model.geom_sameframe[i] = 0  # it may be turned now
-        model.geom_aabb[i] = [0, 0, 0, *half]
-        model.geom_rbound[i] = np.linalg.norm(half) if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX else half[2]
+    model.geom_sameframe[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = 0  # they are turned now
     return model
 
 
