@@ -10,7 +10,7 @@ too rare to choose by, but how often it comes nearer to something than `TIGHT` t
 Source: Ross, Gordon & Bagnell 2011 (DAgger).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,31 @@ import numpy as np
 
 from lgmdjax import cpg, drivers, episodes, navigator, rollout, scales, scores, simulation, tapes, training
 from lgmdjax.episodes import Walk
+from lgmdjax.errors import InputError
 from lgmdjax.stages import crew
 
 OWN_WALKS = 2**19  # number of the first episode that the navigator walks itself: rooms of their own
 TRYOUT = 2**20  # number of the episode whose rooms caution is chosen in
 TIGHT = 0.08  # m of clearance
 KEPT_BACK = 0.25  # share of the rooms that no learner is shown; half of them choose its best epoch, half judge it
+
+
+def lesson(
+    folder: Path, robot: simulation.Params, robots: int, seconds: float, seed: int, facts: Mapping[str, Any]
+) -> list[Walk]:
+    """Let a robot's teacher walk in rooms to learn in, with its eyes open."""
+    how = {"seed": seed, "facts": {**facts, "robot": crew.digest(robot)}, "label": "lesson", "draw": True}
+    crew.walked(folder, robot, crew.rooms_of(seed, 0, robots), seconds, drivers.TEACHER, **how)
+    return episodes.read(folder)
+
+
+def learn(
+    folder: Path, walks: Sequence[Walk], epochs: int, seed: int, variant: navigator.Variant = "lstm"
+) -> tuple[navigator.Params, list[Walk]]:
+    """Fit a new navigator to walks; give the best one, and the stretches that it was chosen by."""
+    train, test, _ = split(episodes.stretches(walks), seed)
+    start, settings = navigator.create(jax.random.key(seed), variant), training.Settings(epochs=epochs)
+    return training.fit(start, train, test, settings, checkpoints=folder).best, test
 
 
 def practise(
@@ -96,6 +115,13 @@ def practised(folder: Path) -> list[Walk]:
     """Read the walks of all rounds of a finished practice."""
     rounds = sorted((folder / "walks").glob("round-*"), key=lambda place: int(place.name.partition("-")[2]))
     return [walk for number, place in enumerate(rounds) for walk in _numbered(place, number)]
+
+
+def recorded_by(inputs: Mapping[str, Path]) -> list[Walk]:
+    """Read all that the run recorded: the teacher's walks and the navigator's own."""
+    if "collect" not in inputs:
+        raise InputError("expected a run whose walks pupils can learn from, got none; name one with --run")
+    return episodes.read(inputs["collect"] / "episodes") + practised(inputs["train"])
 
 
 def split(walks: Sequence[Walk], seed: int) -> tuple[list[Walk], list[Walk], list[Walk]]:

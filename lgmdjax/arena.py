@@ -163,9 +163,10 @@ def tangents(
         distances = jnp.take_along_axis(_distances(arena, p + shift, q + shift), nearest, axis=-1)[..., 0]
         return jnp.sum(distances), distances
 
-    normals, distances = jax.grad(apart, has_aux=True)(jnp.zeros_like(p))
-    ahead = jnp.asarray([1.0, 0.0], normals.dtype)
-    normals = jnp.where(jnp.any(normals != 0, axis=-1, keepdims=True), normals, ahead)
+    slope: Array
+    slope, distances = jax.grad(apart, has_aux=True)(jnp.zeros_like(p))
+    some = jnp.any(slope != 0, axis=-1, keepdims=True)
+    normals = jnp.where(some, slope, jnp.asarray([1.0, 0.0], p.dtype))
     support = jnp.minimum(jnp.sum(normals * p, axis=-1), jnp.sum(normals * q, axis=-1))
     return normals, support - distances
 

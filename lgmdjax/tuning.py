@@ -90,13 +90,7 @@ def tune(
     whole, steps = sizes(params.controller, settings.parts), settings.windows * settings.rooms
     # What keeps Adam from dividing by zero must be small beside all slopes.
     optimiser = optax.adam(optax.cosine_decay_schedule(settings.learning_rate, steps), eps=1e-15)
-
-    @jax.jit
-    def update(nerves: controller.Params, state: Any, slope: controller.Params) -> tuple[controller.Params, Any]:
-        both: Any = tied(slope)
-        changes: Any
-        changes, state = optimiser.update(both, state)
-        return moved(nerves, changes, whole), state
+    update = _follower(optimiser, whole)
 
     def practise(done: Progress, here: Room) -> Progress:
         nerves, state, rows = done.nerves, done.optimiser, []
@@ -121,6 +115,19 @@ def tune(
         if saved is not None:
             saved.save(number + 1, done)
     return replace(params, controller=done.nerves), [Row(*row) for row in np.asarray(done.rows).tolist()]
+
+
+def _follower(optimiser: optax.GradientTransformation, sizes: controller.Params) -> Callable[..., Any]:
+    """Make what follows a slope by a step: nerves, state of the optimiser, slope -> nerves, state."""
+
+    @jax.jit
+    def update(nerves: controller.Params, state: Any, slope: controller.Params) -> tuple[controller.Params, Any]:
+        both: Any = tied(slope)
+        changes: Any
+        changes, state = optimiser.update(both, state)
+        return moved(nerves, changes, sizes), state
+
+    return update
 
 
 def sizes(nerves: controller.Params, parts: tuple[str, ...]) -> controller.Params:

@@ -54,7 +54,6 @@ from lgmdjax import apprentice, controller, cpg, drivers, figures, files, hexapo
 from lgmdjax.checkpoints import Checkpoints
 from lgmdjax.simulation import FRAME_RATE, Params, Record, Room, Through
 from lgmdjax.stages import crew
-from lgmdjax.studies import teaching
 
 ROOMS = 2**21  # number of the first episode that robots are tuned in: rooms of their own
 JOINT = ("driver", "shaping", "lgmd.threshold", "lgmd.suppression", "lgmd.inhibition")
@@ -100,13 +99,13 @@ def pupils(
     """Yield the pupils of a start, one by one: name, robot, and how it was tuned, if it was."""
     school = settings.practice
     facts = {"school": asdict(school), "seconds": settings.lesson_seconds}
-    walks = teaching.lesson(folder / "lesson", robot, school.robots, settings.lesson_seconds, seed, facts)
+    walks = apprentice.lesson(folder / "lesson", robot, school.robots, settings.lesson_seconds, seed, facts)
 
     def practised(rounds: int) -> Params:
         practice = replace(school, rounds=rounds)
         own = apprentice.practise(folder / "dagger", robot, walks, practice, seed)
         place = folder / "checkpoints" / f"rounds-{rounds}"
-        return crew.manned(robot, teaching.learn(place, own, school.epochs, seed)[0])
+        return crew.manned(robot, apprentice.learn(place, own, school.epochs, seed)[0])
 
     first = practised(0)
     yield "imitation", first, {}

@@ -63,7 +63,6 @@ from lgmdjax.errors import InputError
 from lgmdjax.sight import Cells, Pilot
 from lgmdjax.simulation import FRAME_RATE, Leaf
 from lgmdjax.stages import crew
-from lgmdjax.studies import sensitivity
 
 METHODS: Mapping[str, tuple[str, ...]] = {
     "calibrated": (),
@@ -77,7 +76,7 @@ ALIKE, AKIN = 0.01, 0.4  # most that u may differ, as a share of its spread: dra
 
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Detector, seed: int) -> None:
     """Draw walks of a run again, and fit by every method from every start; what was fitted before is kept."""
-    recorded = sensitivity.recorded_by(inputs)
+    recorded = apprentice.recorded_by(inputs)
     robot = crew.trained(inputs["fit-gait"], inputs["train"])
     lesson = scales.Eyes(**episodes.parameters(inputs["collect"] / "episodes")["eyes"])
     walks, cells = look(robot, pick(recorded, settings, seed), lesson)

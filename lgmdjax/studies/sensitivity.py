@@ -34,7 +34,6 @@ from matplotlib.figure import Figure
 
 from lgmdjax import apprentice, cpg, drivers, episodes, figures, files, navigator, scales, scores, simulation, training
 from lgmdjax.episodes import Walk
-from lgmdjax.errors import InputError
 from lgmdjax.simulation import FRAME_RATE
 from lgmdjax.stages import crew
 
@@ -68,7 +67,7 @@ AXES = {
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity, seed: int) -> None:
     """Score the robot with every change, and every pupil."""
     robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
-    recorded = recorded_by(inputs)  # before hours of walking
+    recorded = apprentice.recorded_by(inputs)  # before hours of walking
     frames = sum(map(len, episodes.stretches(recorded)))
     rows, chosen = [], settled(robot, settings.bench.eyes)
     for _, same in groupby(changes(robot, settings.bench.eyes), key=itemgetter(0)):
@@ -170,13 +169,6 @@ def _evenly(stretches: Sequence[Walk], frames: int, generator: np.random.Generat
         chosen += _cut(some, share, generator)
         left -= share
     return chosen
-
-
-def recorded_by(inputs: Mapping[str, Path]) -> list[Walk]:
-    """Read all that the run recorded: the teacher's walks and the navigator's own."""
-    if "collect" not in inputs:
-        raise InputError("expected a run whose walks pupils can learn from, got none; name one with --run")
-    return episodes.read(inputs["collect"] / "episodes") + apprentice.practised(inputs["train"])
 
 
 def _fit(folder: Path, walks: list[Walk], epochs: int, seed: int) -> navigator.Params:

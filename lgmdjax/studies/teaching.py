@@ -27,7 +27,6 @@ from lgmdjax import (
     braitenberg,
     cpg,
     drivers,
-    episodes,
     figures,
     files,
     navigator,
@@ -36,7 +35,6 @@ from lgmdjax import (
     simulation,
     training,
 )
-from lgmdjax.episodes import Walk
 from lgmdjax.stages import crew
 
 _PRINTED = braitenberg.Params(full_turn=0.0, symmetry=0.0)  # eq. 22 within the gait's range
@@ -94,28 +92,11 @@ def teach(
 ) -> simulation.Params:
     """Let a robot's teacher walk, its pupil practise, and fit the pupil once more; give the robot with it aboard."""
     school = settings.practice
-    walks = lesson(folder / "lesson", robot, school.robots, settings.lesson_seconds, seed, {"school": asdict(settings)})
+    facts = {"school": asdict(settings)}
+    walks = apprentice.lesson(folder / "lesson", robot, school.robots, settings.lesson_seconds, seed, facts)
     walks = apprentice.practise(folder, robot, walks, school, seed, variant)
-    learned, test = learn(folder / "checkpoints" / "last", walks, school.epochs, seed, variant)
+    learned, test = apprentice.learn(folder / "checkpoints" / "last", walks, school.epochs, seed, variant)
     return crew.manned(robot, training.enliven(learned, test))
-
-
-def lesson(
-    folder: Path, robot: simulation.Params, robots: int, seconds: float, seed: int, facts: Mapping[str, Any]
-) -> list[Walk]:
-    """Let a robot's teacher walk in rooms to learn in, with its eyes open."""
-    how = {"seed": seed, "facts": {**facts, "robot": crew.digest(robot)}, "label": "lesson", "draw": True}
-    crew.walked(folder, robot, crew.rooms_of(seed, 0, robots), seconds, drivers.TEACHER, **how)
-    return episodes.read(folder)
-
-
-def learn(
-    folder: Path, walks: Sequence[Walk], epochs: int, seed: int, variant: navigator.Variant = "lstm"
-) -> tuple[navigator.Params, list[Walk]]:
-    """Fit a new navigator to walks; give the best one, and the stretches that it was chosen by."""
-    train, test, _ = apprentice.split(episodes.stretches(walks), seed)
-    start, settings = navigator.create(jax.random.key(seed), variant), training.Settings(epochs=epochs)
-    return training.fit(start, train, test, settings, checkpoints=folder).best, test
 
 
 def _score(
