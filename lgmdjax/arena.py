@@ -57,7 +57,6 @@ __all__ = [
     "place",
     "tangents",
     "validate",
-    "walls",
 ]
 
 ROBOT_HEIGHT = 0.35
@@ -147,14 +146,15 @@ def tangents(
 ) -> tuple[Float[Array, "s 2"], Float[Array, " s"]]:
     """Find for each plane segment the line n . x = c that parts it from the obstacle or wall nearest to it.
 
-    With d(t) the signed distance of that thing from the segment shifted by t, n = dd/dt at t = 0, which is of length 1,
-    and c = min(n . p, n . q) - d(0), p and q the ends. All of the thing lies at n . x <= c, since it is convex. n is
-    along x where a cylinder's axis lies on the segment.
+    With d(t) the signed distance of that thing from the segment shifted by t, n = dd/dt at t = 0 and
+    c = min(n . p, n . q) - d(0), p and q the ends. All of the thing lies at n . x <= c, since it is convex. Where the
+    segment cuts it, n is the shortest way out; of two as short a mean, and x where there is none to be named, as on a
+    cylinder's axis.
 
-    Gradient: that of the nearest feature.
+    Gradient: that of the nearest feature; the line turns the faster, the nearer a corner is.
 
     Returns:
-        n and c [m].
+        n, of length 1, and c [m].
     """
     p, q = starts[..., :2], ends[..., :2]
     nearest = jnp.argmin(_distances(arena, p, q), axis=-1, keepdims=True)
@@ -165,8 +165,9 @@ def tangents(
 
     slope: Array
     slope, distances = jax.grad(apart, has_aux=True)(jnp.zeros_like(p))
-    some = jnp.any(slope != 0, axis=-1, keepdims=True)
-    normals = jnp.where(some, slope, jnp.asarray([1.0, 0.0], p.dtype))
+    square = jnp.sum(slope * slope, axis=-1, keepdims=True)
+    unit = slope / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    normals = jnp.where(square > 0, unit, jnp.asarray([1.0, 0.0], p.dtype))
     support = jnp.minimum(jnp.sum(normals * p, axis=-1), jnp.sum(normals * q, axis=-1))
     return normals, support - distances
 
@@ -182,17 +183,6 @@ def _distances(arena: Arena, p: Float[Array, "s 2"], q: Float[Array, "s 2"]) -> 
 def is_overhead(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
     """Tell which prisms hang above the robot."""
     return prisms.bottom >= ROBOT_HEIGHT
-
-
-def walls(arena: Arena, thickness: float = 1.0) -> Prisms:
-    """Turn the walls into four boxes behind their inner faces, in the order of `room`."""
-    x_min, x_max, y_min, y_max = arena.room
-    x, y, half = 0.5 * (x_min + x_max), 0.5 * (y_min + y_max), 0.5 * thickness
-    length, width = 0.5 * (x_max - x_min) + thickness, 0.5 * (y_max - y_min) + thickness
-    centre = [[x_min - half, y], [x_max + half, y], [x, y_min - half], [x, y_max + half]]
-    half_size = [[half, width], [half, width], [length, half], [length, half]]
-    boxes = place(jnp.asarray(centre), jnp.asarray(half_size), arena.wall_height, texture=arena.wall_texture, count=4)
-    return jax.tree.map(lambda leaf: leaf.astype(arena.room.dtype), boxes)
 
 
 def margins(arena: Arena, poses: Float[Array, "n 3"], ahead: float = 0.3) -> Float[Array, " n"]:

@@ -55,6 +55,7 @@ class _Anatomy(NamedTuple):
     capsules: np.ndarray  # (13,) geoms that collide with obstacles
     feet: np.ndarray  # (6,) geoms that stand on the floor
     barriers: np.ndarray  # (13,) planes, one for each of the capsules
+    shapes: tuple[str, ...]  # names of all geoms
 
 
 def xml_path() -> Path:
@@ -87,9 +88,19 @@ def load(path: Path | str | None = None) -> mujoco.MjModel:
 
 
 def build(model: mujoco.MjModel | None = None) -> mjx.Model:
-    """Put the robot (default: `load()`) on the device for MJX, in the precision that JAX is set to."""
+    """Put the robot (default: `load()`) on the device for MJX, in the precision that JAX is set to.
+
+    Raises InputError for a variant whose shapes are not those of the package's XML, or in another order.
+    """
+    model = load() if model is None else model
+    for expected, found in zip(_anatomy().shapes, _shapes(model), strict=False):
+        if found != expected:
+            raise InputError(
+                f"expected the geoms of this package's hexapod.xml in its order, got {found or 'one without a name'} "
+                f"for {expected}: start from that file, and add others at its end"
+            )
     with jax.numpy_dtype_promotion("standard"):
-        return _free(mjx.put_model(load() if model is None else model, impl="jax"))
+        return _free(mjx.put_model(model, impl="jax"))
 
 
 def softened(model: mjx.Model) -> mjx.Model:
@@ -118,7 +129,12 @@ def _anatomy() -> _Anatomy:
         capsules=geoms([*CAPSULES]),
         feet=geoms([f"{leg}_foot" for leg in LEGS]),
         barriers=geoms([f"before_{name}" for name in CAPSULES]),
+        shapes=_shapes(model),
     )
+
+
+def _shapes(model: mujoco.MjModel) -> tuple[str, ...]:
+    return tuple(model.geom(index).name for index in range(model.ngeom))
 
 
 def _free(tree: Any) -> Any:
@@ -174,10 +190,11 @@ def place_obstacles(model: mjx.Model, room: arena.Arena, data: mjx.Data) -> mjx.
     """Put a barrier between each shape that collides and what is nearest to it where the robot stands.
 
     A barrier is an upright plane that touches the nearest obstacle or wall (`arena.tangents`): it is as far off as
-    that, and holds as long as the robot has moved little, as in a frame. Of two things that a shape would touch at
-    once, as the walls of a corner, it knows the nearer one only.
+    that. It is meant for a frame: planes have no end, and a foot in swing, which moves by a centimetre or two until
+    the next, may meet air beyond the edge of a thing. Of two things that a shape would touch at once, as the walls of
+    a corner, it knows the nearer one only. What counts as a touch is measured apart (`arena.clearance`).
 
-    Gradient: through where and how the planes stand.
+    Gradient: by the room and by the pose, through where and how the planes stand; which thing is nearest has none.
     """
     with jax.numpy_dtype_promotion("standard"):
         starts, ends, _ = capsules(model, mjx.kinematics(model, data))

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
@@ -61,7 +62,18 @@ def surfaces(room: arena.Arena, time: float) -> Surfaces:
 def _solids(room: arena.Arena, time: Array | float) -> tuple[prisms.Prisms, prisms.Prisms]:
     """Put the boxes, with the walls as the last four, and the cylinders where they are at `time` [s]."""
     scene = arena.at(room, time)
-    return prisms.join(scene.boxes, arena.walls(scene)), scene.cylinders
+    return prisms.join(scene.boxes, _walls(scene)), scene.cylinders
+
+
+def _walls(room: arena.Arena) -> prisms.Prisms:
+    """Turn the walls into four boxes of 1 m behind their inner faces, in the order of `room`."""
+    x_min, x_max, y_min, y_max = room.room
+    x, y, half = 0.5 * (x_min + x_max), 0.5 * (y_min + y_max), 0.5
+    length, width = 0.5 * (x_max - x_min) + 1.0, 0.5 * (y_max - y_min) + 1.0
+    centre = [[x_min - half, y], [x_max + half, y], [x, y_min - half], [x, y_max + half]]
+    half_size = [[half, width], [half, width], [length, half], [length, half]]
+    boxes = prisms.place(jnp.asarray(centre), jnp.asarray(half_size), room.wall_height, count=4)
+    return jax.tree.map(lambda leaf: leaf.astype(room.room.dtype), boxes)
 
 
 def nearest(surfaces: Surfaces, points: Float[ndarray, "n 2"]) -> Float[ndarray, "n surfaces 2"]:

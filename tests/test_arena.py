@@ -133,7 +133,7 @@ def test_what_hangs_overhead_cannot_be_touched() -> None:
     assert float(clearance(room, np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1))[0]) == 3.0
 
 
-def test_clearance_has_finite_slopes_where_it_has_corners() -> None:
+def test_clearance_and_tangents_have_finite_slopes_where_there_are_corners() -> None:
     """Balls and upright capsules on a cylinder's axis, a box's corner and middle; one through the axis."""
     room = arena.empty_room(boxes=arena.place([[1.0, 1.0]], 0.2, 1.0), cylinders=arena.place([[-1.0, 0.0]], 0.2, 1.0))
     starts = jnp.asarray([[-1.0, 0.0, 0.1], [-1.2, 0.0, 0.1], [0.8, 0.8, 0.1], [1.0, 1.0, 0.1], [0.5, 0.8, 0.1]])
@@ -142,8 +142,15 @@ def test_clearance_has_finite_slopes_where_it_has_corners() -> None:
     def total(starts: jax.Array, ends: jax.Array, room: arena.Arena) -> jax.Array:
         return jnp.sum(arena.clearance(room, starts, ends, jnp.full(5, 0.05)))
 
-    slopes = jax.jit(jax.grad(total, argnums=(0, 1, 2)))(starts, ends, room)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    def turned(starts: jax.Array, ends: jax.Array, room: arena.Arena) -> jax.Array:
+        normals, offsets = arena.tangents(room, starts, ends)
+        return jnp.sum(normals * offsets[:, None])
+
+    for told in (total, turned):
+        slopes = jax.jit(jax.grad(told, argnums=(0, 1, 2)))(starts, ends, room)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
+    normals, _ = tangents(room, starts, ends)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
 
 
 def test_clearance_grows_as_fast_as_the_robot_backs_off() -> None:
@@ -179,15 +186,26 @@ def test_tangents_part_each_segment_from_what_it_would_touch_first() -> None:
     """Wherever it lies, in an obstacle too: they touch one thing, from which the segment is as far as from the line."""
     room = jax.tree.map(np.asarray, scenes.testing_room())
     rng = np.random.default_rng(2)
-    starts = rng.uniform(-3.8, 3.8, (200, 2))
-    ends = starts + rng.uniform(-0.15, 0.15, (200, 2))
+    starts = rng.uniform(-3.8, 3.8, (600, 2))
+    ends = starts + rng.uniform(-0.15, 0.15, (600, 2))
     normals, offsets = map(np.asarray, tangents(room, jnp.asarray(starts), jnp.asarray(ends)))
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    cut = 0
     for start, end, normal, offset in zip(starts, ends, normals, offsets, strict=True):
         assert np.abs(farthest(room, normal) - offset).min() < 1e-9
         there = reference.point_to_room(room, reference.segment(start, end)).min()
         known = min(normal @ start, normal @ end) - offset
-        assert known == pytest.approx(there, abs=1e-5) or max(known, there) < 0
+        if there > 0:
+            assert known == pytest.approx(there, abs=1e-5)
+            continue
+        # Cut, it is free once it is shifted as far as the line says, and not before.
+        way = -known * normal
+        ends_apart = [
+            reference.point_to_room(room, reference.segment(start, end) + by * way).min() for by in (0.9, 1.1)
+        ]
+        assert ends_apart[0] < 0 < ends_apart[1]
+        cut += 1
+    assert cut > 10
 
 
 def test_of_two_things_equally_near_the_tangent_is_of_one() -> None:

@@ -224,7 +224,9 @@ def test_obstacles_stop_trunk_and_legs(model, run):
 def barrier(placed: mjx.Model, shape: str) -> tuple[np.ndarray, float]:
     """Read a barrier's normal and how far it is from the origin, by SciPy."""
     index = hexapod.load().geom(f"before_{shape}").id
-    turned = Rotation.from_quat(placed.geom_quat[index], scalar_first=True)
+    quaternion = np.asarray(placed.geom_quat[index])
+    assert np.linalg.norm(quaternion) == pytest.approx(1.0, abs=1e-6)
+    turned = Rotation.from_quat(quaternion, scalar_first=True)
     normal = turned.apply([0.0, 0.0, 1.0])
     return normal, float(normal @ np.asarray(placed.geom_pos[index]))
 
@@ -357,3 +359,7 @@ def test_bad_robot_files_are_named(tmp_path: Path):
     with pytest.raises(InputError, match="expected 18 servos"):
         hexapod.load(cart)
     assert hexapod.load(hexapod.xml_path()).nu == 18
+    shuffled = tmp_path / "shuffled.xml"
+    shuffled.write_text(hexapod.xml_path().read_text().replace("before_bumper", "slot_bumper"))
+    with pytest.raises(InputError, match="got slot_bumper for before_bumper"):
+        hexapod.build(mujoco.MjModel.from_xml_path(str(shuffled)))

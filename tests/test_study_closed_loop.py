@@ -12,7 +12,7 @@ import synthetic
 from lgmdjax import apprentice, figures, imitation, lgmd, navigator, scales, scores, shaping, simulation, tuning
 from lgmdjax.errors import InputError
 from lgmdjax.stages import crew
-from lgmdjax.studies import alone, closed_loop, teaching
+from lgmdjax.studies import alone, closed_loop
 
 EYES = scales.Eyes(width=80, height=60, pooling=3)
 PRACTICE = scales.Train(eyes=EYES, epochs=1, rounds=2, round_epochs=1, robots=4, round_seconds=3.0)
@@ -128,8 +128,8 @@ def taught(monkeypatch):
         return params, [row] * settings.rooms * settings.windows
 
     monkeypatch.setattr(crew, "walked", lambda folder, params, rooms, *_, **__: synthetic.walk(len(rooms.starts), 60))
-    monkeypatch.setattr(teaching, "lesson", lambda *_: [])
-    monkeypatch.setattr(teaching, "learn", learn)
+    monkeypatch.setattr(apprentice, "lesson", lambda *_: [])
+    monkeypatch.setattr(apprentice, "learn", learn)
     monkeypatch.setattr(apprentice, "practise", practise)
     monkeypatch.setattr(tuning, "tune", tune)
     return asked
