@@ -1,8 +1,7 @@
 """Keep what came of a run, without its walks: `python experiments/keep_results.py runs/paper-2026 experiments/results`.
 
-Walks and checkpoints are hundreds of megabytes, tables and figures one or two. What is kept is a run folder still:
-`lgmdjax report --scale paper --seed 2026 --out experiments/results` draws its page again, and a run whose last stages
-are missing goes on from it, as far as those do not ask for walks.
+Walks and checkpoints are hundreds of megabytes, tables and figures two or three. What is kept is a run folder still, and
+goes on with the stages that are missing, as far as those do not ask for walks; the report's page asks for some.
 """
 
 import json
@@ -16,7 +15,8 @@ from lgmdjax.cli import guarded
 from lgmdjax.errors import InputError
 from lgmdjax.files import read_json, write_json
 
-LEFT_OUT = ("*.parquet", "checkpoints", "walks", "episodes", "pupils", ".lock", "*.partial*", "report")
+WALKS = ("*.parquet", "walk.npz", "trajectories.npz", "walks", "episodes")
+LEFT_OUT = (*WALKS, "checkpoints", "pupils", ".lock", "*.partial*", "report")
 
 
 def main(run: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:

@@ -10,21 +10,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from slopes import Routes, along, direction
+from slopes import QUICKLY_COMPILED, Routes, along, direction
 
 from lgmdjax import arena, camera, cpg, drivers, hexapod, imitation, lgmd, navigator, rollout, simulation, tuning
 from lgmdjax.checkpoints import Checkpoints
 from lgmdjax.stages import crew
 
 
+@pytest.fixture(scope="module", autouse=True)
+def quickly():
+    """Compile the gradient of a crowd without optimising it, here and in what follows it."""
+    how = {"static_argnames": "settings", "donate_argnames": "states", "compiler_options": QUICKLY_COMPILED}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(imitation, "gradient", jax.jit(imitation.gradient.__wrapped__, **how))
+        yield
+
+
 @pytest.fixture(scope="module")
 def params():
-    """A robot that looks and walks, its thresholds smooth, its rhythm in one Runge-Kutta step to compile the less."""
+    """A robot that looks and walks, its thresholds smooth.
+
+    To compile the less, its rhythm takes one Runge-Kutta step, and its eyes sort few prisms.
+    """
     return simulation.assemble(
         navigator.create(jax.random.key(3)),
         detector=lgmd.Params(threshold=0.5, suppression=30.0, suppression_width=10.0, smooth=True),
         rhythm=cpg.Params(substeps=1),
-        eyes=camera.Params(width=48, height=36, overlap=0.6),
+        eyes=camera.Params(width=48, height=36, overlap=0.6, slots=2, bands=2),
     )
 
 
@@ -49,7 +61,7 @@ def model():
 def walked(params, room, model):
     """Ten frames: where they end, what they left behind, and the gradient through the controller alone."""
     settings = imitation.Settings(frames=10, through="controller")
-    walk = jax.jit(jax.grad(imitation.loss, has_aux=True), static_argnums=5)
+    walk = jax.jit(jax.grad(imitation.loss, has_aux=True), static_argnums=5, compiler_options=QUICKLY_COMPILED)
     start = simulation.init(params, model, room, drivers.LEARNED)
     gradient, (end, record) = walk(params.controller, params, model, room, start, settings)
     return start, end, record, gradient
