@@ -23,10 +23,10 @@ def walked(teacher: braitenberg.Params) -> simulation.Record:
 
 @pytest.mark.slow
 def test_teacher_walks_the_training_room_and_touches_nothing():
-    """It goes 3.3 to 3.8 m, all robots meet something to turn from, and no leg comes nearer to it than 0.14 m."""
+    """It goes 2.7 to 3.7 m, all robots meet something to turn from, and no leg comes nearer to it than 0.25 m."""
     record = walked(TEACHER)
     assert record.ok.all() and not record.contact.any()
-    assert record.clearance.min() > 0.05
+    assert record.clearance.min() > 0.1
     assert record.distances.min(axis=(1, 2)).max() < 0.7
     places = record.position[..., :2]
     assert np.linalg.norm(np.diff(places, axis=1), axis=-1).sum(axis=1).min() > 2.5
