@@ -1,7 +1,7 @@
 """Keep what came of a run, without its walks: `python experiments/keep_results.py runs/paper-2026 experiments/results`.
 
-Walks and checkpoints are hundreds of megabytes, tables and figures two or three. What is kept is a run folder still, and
-goes on with the stages that are missing, as far as those do not ask for walks; the report's page asks for some.
+Walks and checkpoints are hundreds of megabytes, tables and figures two or three. What is kept is a run folder still,
+and goes on with the stages that are missing, as far as those do not ask for walks; the report's page asks for some.
 """
 
 import json
