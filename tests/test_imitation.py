@@ -22,7 +22,8 @@ def quickly():
     """Compile the gradient of a crowd without optimising it, here and in what follows it."""
     how = {"static_argnames": "settings", "donate_argnames": "states", "compiler_options": QUICKLY_COMPILED}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(imitation, "gradient", jax.jit(imitation.gradient.__wrapped__, **how))
+        program: Any = imitation.gradient
+        patch.setattr(imitation, "gradient", jax.jit(program.__wrapped__, **how))
         yield
 
 
