@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lgmdjax import __version__, versions
+from lgmdjax import __version__, programs, versions
 from lgmdjax.errors import InputError
 from lgmdjax.files import write_json
 
@@ -129,20 +129,13 @@ def _do(run: Run, stage: Stage, print_: str) -> None:
         inputs = {name: run.folder / name for name in stage.inputs}
         stage.work(partial, inputs, run.settings[stage.name], run.seed)
         seconds = time.perf_counter() - began
-        _forget()
+        programs.let_go()
         stamp = {"fingerprint": print_, "seconds": round(seconds, 1), "versions": versions.installed()}
         write_json(partial / "done.json", stamp | {"device": device(), "files": _sizes(partial)})
         print(f"{stage.name}: done in {seconds:.0f} s", flush=True)
     if final.exists():
         shutil.rmtree(final)
     os.replace(partial, final)
-
-
-def _forget() -> None:
-    """Let go of a stage's programs: their code is mapped in thousands of pieces, of which Linux allows only so many."""
-    import jax  # as in `device`
-
-    jax.clear_caches()
 
 
 def device() -> str:

@@ -199,7 +199,16 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
     "smoke": {
         "fit-gait": FitGait(steps=300, seconds=6),
         "collect": Collect(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=5),
-        "train": Train(eyes=_SMALL, epochs=5, rounds=1, round_epochs=5, robots=4, round_seconds=10, halves_epochs=5),
+        "train": Train(
+            eyes=_SMALL,
+            epochs=5,
+            rounds=1,
+            round_epochs=5,
+            robots=4,
+            round_seconds=10,
+            halves_epochs=5,
+            variants=("lstm", "feed-forward", "mean"),
+        ),
         "evaluate": Evaluate(
             places=(
                 Place(trial="testing", eyes=_SMALL, seeds=4, seconds=5),

@@ -29,6 +29,7 @@ from lgmdjax import (
     hexapod,
     legs,
     lesson,
+    programs,
     scales,
     scores,
     shaping,
@@ -55,7 +56,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Printed, see
     rows = []
     for name, change in CASES.items():
         rows.append(_measure(folder, name, change(robot, folder), settings, seed))
-        jax.clear_caches()  # nearly every case has a program of its own (see `lgmdjax.runs`)
+        programs.let_go()  # nearly every case has its own
     files.write_json(folder / "printed.json", rows)
 
 

@@ -32,7 +32,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lgmdjax import apprentice, cpg, drivers, episodes, figures, files, navigator, scales, scores, simulation, training
+from lgmdjax import (
+    apprentice,
+    cpg,
+    drivers,
+    episodes,
+    figures,
+    files,
+    navigator,
+    programs,
+    scales,
+    scores,
+    simulation,
+    training,
+)
 from lgmdjax.episodes import Walk
 from lgmdjax.simulation import FRAME_RATE
 from lgmdjax.stages import crew
@@ -73,14 +86,14 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity,
     for _, same in groupby(changes(robot, settings.bench.eyes), key=itemgetter(0)):
         for axis, value, changed, contrast in same:
             rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
-        jax.clear_caches()  # programs for other eyes: Linux lets a process hold the code of about ten walks
+        programs.let_go()  # other eyes have their own
     for axis, value, walks in lessons(recorded, seed):
         epochs = fair(settings.epochs, frames, sum(map(len, walks)))
         for start in range(settings.seeds):
             place = folder / "pupils" / f"{axis}-{value:g}-{start}"
             pupil = crew.manned(robot, _fit(place, walks, epochs, seed + start))
             rows.append(_score(folder, pupil, settings.bench, seed, axis, value, start=start))
-        jax.clear_caches()  # and of the fits: each amount of data has its own
+        programs.let_go()  # and so has each amount of data
     rows = [row | {"chosen": row["value"] == chosen.get(row["axis"])} for row in rows]
     files.write_json(folder / "sensitivity.json", rows)
 

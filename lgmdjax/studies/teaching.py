@@ -30,6 +30,7 @@ from lgmdjax import (
     figures,
     files,
     navigator,
+    programs,
     scales,
     scores,
     simulation,
@@ -77,7 +78,7 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Teaching, se
             pupil = teach(place, under(robot, case.rule), case.variant, settings, seed + number)
             facts = {"rule": case.rule, "variant": case.variant, "start": number}
             rows.append(_score(place / "bench", pupil, settings, drivers.LEARNED, seed, **facts))
-        jax.clear_caches()  # of a start's fits and walks, two dozen programs (see `lgmdjax.runs`)
+        programs.let_go()  # a start's fits and walks are two dozen
     files.write_json(folder / "teaching.json", rows)
 
 
