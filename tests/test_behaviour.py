@@ -124,7 +124,7 @@ def test_does_not_see_a_wall_without_contrast(walks):
 
 @pytest.mark.parametrize("kind", ["box to the left", "tube to the left"])
 def test_turns_away_from_what_is_on_its_side_and_mirrors_when_mirrored(walks, kind):
-    """Where it has got farthest ahead it is to the right of its way; the thing is to the left, mirrored to the right."""
+    """Where it has got farthest ahead it is to the right of its way; mirrored, to the left."""
     place = walks["learned"].position[of_kind(kind)]
     farthest = np.take_along_axis(place, place[..., :1].argmax(axis=-2)[..., None], axis=-2)[..., 0, :]
     away = farthest[..., 1] * np.array([1.0, -1.0]) < 0
