@@ -1,6 +1,7 @@
 """The teacher in its body: what it teaches is a walk that touches nothing, where eq. 22 by itself does."""
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ TEACHER = braitenberg.Params()
 RULE = replace(TEACHER, full_turn=0.0, symmetry=0.0)  # eq. 22 within the gait's range
 
 
+@cache  # two tests look at the walks of the same rule
 def walked(teacher: braitenberg.Params) -> simulation.Record:
     """Put eight robots into the middle of the paper's training room, each turned its own way, for a minute."""
     params = simulation.assemble(teacher, teacher=teacher, eyes=camera.Params(width=16, height=12))
@@ -34,7 +36,7 @@ def test_teacher_walks_the_training_room_and_touches_nothing():
 
 
 def test_vehicle_2a_alone_runs_into_things_and_3b_alone_hardly_gets_on():
-    """Sec. 4.2: the one speeds up before an obstacle; the other slows down, and stands before it."""
+    """Sec. 4.2 calls both poor: half of the robots touch something by the one; the other loses a third of the pace."""
     alone_2a, alone_3b, both = (walked(replace(RULE, **gain)) for gain in ({"gain_3b": 0.0}, {"gain_2a": 0.0}, {}))
     assert alone_2a.contact.any(axis=1).sum() >= 4
     assert alone_3b.contact.any(axis=1).sum() <= 2
