@@ -185,6 +185,7 @@ def _in_antiphase(even: tuple[float, float]) -> Float[Array, "6 2"]:
     return jnp.asarray([even, even[::-1]] * (LEGS // 2), dtype=float)
 
 
+@jax.checkpoint  # in reverse mode XLA otherwise merges the steps, and computes the first anew for each that follows
 def _runge_kutta(params: Params, state: State, h: Float[Array, ""] | float) -> State:
     """Take one classical fourth-order step of `h` time units."""
 

@@ -26,8 +26,6 @@ from mujoco import mjx
 
 from lgmdjax import cpg, hexapod, shaping, treadmill
 
-BLOCK = 6  # physics steps that are walked again as one on the way back
-
 
 @struct.dataclass(kw_only=True)
 class Legs:
@@ -80,11 +78,12 @@ def start(legs: Legs, model: mjx.Model, phase: Float[Array, ""] | float) -> Walk
 
 
 def walk(
-    legs: Legs, model: mjx.Model, walker: Walker, velocity: Float[Array, "2"], blocks: int
+    legs: Legs, model: mjx.Model, walker: Walker, velocity: Float[Array, "2"], steps: int
 ) -> tuple[Course, Walker]:
-    """Walk one robot for a window of `blocks` at a velocity (left, right), and measure it."""
+    """Walk one robot for a window of physics steps at a velocity (left, right), and measure it."""
     rhythm, networks = parts(legs)
 
+    @partial(jax.checkpoint, prevent_cse=False)  # walked again on the way back: its inside need not be kept
     def step(walker: Walker, _: None):
         state, signal = cpg.step(rhythm, walker.rhythm, treadmill.STEP)
         data = hexapod.substep(model, walker.data, shaping.shape(networks, signal, velocity))
@@ -92,14 +91,10 @@ def walk(
         tilt = hexapod.rotation(pose)[2, :2]  # of pitch and roll, both small
         return Walker(data=data, rhythm=state), (pose.position[:2], hexapod.yaw(pose), tilt, data.actuator_force)
 
-    @partial(jax.checkpoint, prevent_cse=False)
-    def block(walker: Walker, _: None):
-        return jax.lax.scan(step, walker, length=BLOCK)
-
-    end, (way, yaw, tilt, force) = jax.lax.scan(block, walker, length=blocks)
+    end, (way, yaw, tilt, force) = jax.lax.scan(step, walker, length=steps)
     pose = hexapod.pose(walker.data)
-    way = jnp.concatenate([pose.position[None, :2], way.reshape(-1, 2)])
-    return measured(way, jnp.append(hexapod.yaw(pose), yaw), tilt.reshape(-1, 2), force), end
+    way = jnp.concatenate([pose.position[None, :2], way])
+    return measured(way, jnp.append(hexapod.yaw(pose), yaw), tilt, force), end
 
 
 def measured(

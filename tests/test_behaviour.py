@@ -4,50 +4,28 @@ One crowd walks once with the controller and once blind, in single precision as 
 image side by side, so that one program serves all.
 """
 
-from dataclasses import replace
 from functools import partial
 
 import jax
 import numpy as np
+import places
 import pytest
 
-from lgmdjax import arena, drivers, hexapod, rollout, scales, scenes, simulation
+from lgmdjax import drivers, hexapod, rollout, scales, scenes
 from lgmdjax.stages import crew
 from lgmdjax.studies import velocity
 
 SECONDS = 30.0
 
 
-def beside(key: jax.Array, lateral: float) -> arena.Arena:
-    """A box of 0.5 m a side, 1 m ahead and so far to the left."""
-    box = arena.place([[1.25, lateral]], [[0.25, 0.25]], [0.8])
-    return scenes.textured(arena.empty_room((10.0, 10.0), boxes=box), key)
-
-
-def before_a_wall(key: jax.Array, contrast: float) -> arena.Arena:
-    """A wall 1.3 m ahead, and all others like it."""
-    room = scenes.textured(arena.empty_room((4.0, 4.0), start=(0.7, 0.0, 0.0)), key)
-    return replace(room, wall_texture=jax.numpy.tile(jax.numpy.array([235.0, contrast, 0.0, 0.45]), (4, 1)))
-
-
-def before_a_corner(key: jax.Array) -> arena.Arena:
-    """A corner 1.6 m ahead, its walls 1.1 m off to the left and to the right alike."""
-    return scenes.textured(arena.empty_room((4.0, 4.0), start=(0.9, 0.9, 0.25 * np.pi)), key)
-
-
-def in_the_testing_room(key: jax.Array) -> arena.Arena:
-    """Fig. 13's room, the robot put down nearer to the box in its middle: 30 s must do."""
-    return replace(scenes.testing_room(key), start=jax.numpy.array([0.1, 1.4, -0.5 * np.pi]))
-
-
 TEXTURES = 3
 PLAIN = "wall without contrast"
 KINDS = {
-    "box to the left": partial(beside, lateral=0.35),  # in the way, and not on both sides of it
+    "box to the left": partial(places.beside, lateral=0.35),  # in the way, and not on both sides of it
     # At full resolution all robots turn away from it at 0.15 m and more, and 14 of 16 at 0.12 m.
     "tube to the left": lambda key: scenes.tube_scene(0.21, key),
     # Its face is farther off than the rule turns from, by as much as a cautious pupil may see in it.
-    "box far to the left": partial(beside, lateral=1.9),
+    "box far to the left": partial(places.beside, lateral=1.9),
     "random room": scenes.random_room,
 }
 SCENES = {
@@ -56,13 +34,13 @@ SCENES = {
     for kind, scene in KINDS.items()
     for number in range(TEXTURES)
 } | {
-    "testing room": in_the_testing_room,
+    "testing room": places.in_the_testing_room,
     "indoor": scenes.indoor_scene,
     "outdoor": scenes.outdoor_scene,
     "dynamic": scenes.dynamic_scene,
-    "corner": before_a_corner,
-    "wall": partial(before_a_wall, contrast=0.25),
-    PLAIN: partial(before_a_wall, contrast=0.0),
+    "corner": places.before_a_corner,
+    "wall": partial(places.before_a_wall, contrast=0.25),
+    PLAIN: partial(places.before_a_wall, contrast=0.0),
 }
 MOST = 0.75  # of walks of a kind
 
@@ -75,14 +53,7 @@ def of_kind(kind: str) -> list[int]:
 def rooms():
     """Build every scene and its mirror image, one after the other."""
     with jax.enable_x64(False):
-        built = [scene(jax.random.key(7)) for scene in SCENES.values()]
-        return rollout.stack(
-            [
-                simulation.Room(arena=room, starts=jax.numpy.tile(room.start, (4, 1)), key=jax.random.key(0))
-                for one in built
-                for room in (one, arena.mirror(one))
-            ]
-        )
+        return places.with_mirror_images([scene(jax.random.key(7)) for scene in SCENES.values()])
 
 
 @pytest.fixture(scope="module")

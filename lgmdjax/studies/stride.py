@@ -94,13 +94,13 @@ def fit(
     legs: Legs, model: mjx.Model, settings: scales.Stride, method: str, seed: int
 ) -> tuple[Legs, list[list[float]], float]:
     """Follow one method's slopes; give the legs, the curve (simulated robot-seconds, loss), and the seconds it took."""
-    blocks, key = round(settings.window / (strides.BLOCK * treadmill.STEP)), jax.random.key(seed)
+    window, key = round(settings.window / treadmill.STEP), jax.random.key(seed)
     sizes = jax.tree.map(lambda leaf: jnp.sqrt(jnp.mean(leaf**2)), legs)
-    began = tasks(legs, model, key, blocks)
+    began = tasks(legs, model, key, window)
 
     def loss(scaled: Legs, task: Task) -> tuple[Float[Array, ""], Walker]:
         own = jax.tree.map(jnp.multiply, scaled, sizes)
-        course, end = strides.walk(own, model, task.walker, task.velocity, blocks)
+        course, end = strides.walk(own, model, task.walker, task.velocity, window)
         sound = hexapod.is_sound(end.data)
         return jnp.where(sound, cost(course, task.velocity, task.first), jnp.nan), end
 
@@ -126,15 +126,15 @@ def fit(
     return jax.tree.map(jnp.multiply, scaled, sizes), curve, time.monotonic() - clock
 
 
-def tasks(legs: Legs, model: mjx.Model, key: Array, blocks: int) -> Task:
+def tasks(legs: Legs, model: mjx.Model, key: Array, window: int) -> Task:
     """Walk all robots until their gait is steady, each from a phase that luck chooses, and measure a first window."""
     velocities = jnp.asarray(COMMANDS * ROBOTS, dtype=float)
-    settling = round(treadmill.SETTLING / (strides.BLOCK * treadmill.STEP))
+    settling = round(treadmill.SETTLING / treadmill.STEP)
 
     def one(phase: Float[Array, ""], velocity: Float[Array, "2"]) -> Task:
         walker = strides.start(legs, model, phase)
         _, walker = strides.walk(legs, model, walker, velocity, settling)
-        first, walker = strides.walk(legs, model, walker, velocity, blocks)
+        first, walker = strides.walk(legs, model, walker, velocity, window)
         return Task(walker=walker, velocity=velocity, first=first)
 
     phases = jax.random.uniform(key, (len(velocities),))
