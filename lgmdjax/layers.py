@@ -25,6 +25,7 @@ from lgmdjax.silhouettes import NEAR, Pair, Silhouette
 from lgmdjax.texture import Texture, Vector
 
 Arrays = TypeVar("Arrays")
+Keep = Callable[[Any], Any]
 
 _FAR = 1.0e3
 """What is farther away [m] is shaded as if it were here."""
@@ -58,34 +59,46 @@ def draw(arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette],
     Gradient: that of the same drawing with its loops as `lax.scan`. Unrolled they are one expression, the fastest to
     evaluate, but its derivative would take minutes to compile.
     """
-    return _draw(_unrolled, arena, eye, pixels, prisms, bands)
+    return _draw(_AT_ONCE, arena, eye, pixels, prisms, bands)
 
 
 @draw.defjvp
 def _draw_jvp(bands: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    return jax.jvp(functools.partial(_draw, _scanned, bands=bands), primals, tangents)
+    _, slope = jax.jvp(functools.partial(_draw, _IN_STEPS, bands=bands), primals, tangents)
+    return draw(*primals, bands), slope  # where both are wanted, too, what is seen is the fast drawing
 
 
-def _draw(scan: Callable, arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette], bands: int) -> Array:
-    room = _room(arena, eye, pixels)
+class _Way(NamedTuple):
+    """How to draw: what goes over prisms and layers, and what is done to arrays that much hangs on."""
+
+    scan: Callable[[Callable, Any, list], tuple[Any, Any]]
+    keep: Callable[[Any, Array], Any]
+
+
+def _draw(way: _Way, arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette], bands: int) -> Array:
+    def keep(arrays: Arrays) -> Arrays:
+        return way.keep(arrays, eye)
+
+    pixels = keep(pixels)
+    room = _room(arena, eye, pixels, keep)
     background = room.first.nearness
     third = _Plain(background, jnp.zeros_like(background), jnp.zeros_like(background))
     nearest = jax.tree.map(lambda a: jnp.broadcast_to(a, background.shape), (room.first, room.second, third))
 
     def insert(layers: tuple[Layer, Layer, _Plain], prism: Silhouette) -> tuple[tuple[Layer, Layer, _Plain], None]:
-        return _insert(_prism(prism, pixels), *layers), None
+        return _insert(_prism(prism, pixels, keep), *layers), None
 
     def shade(carry: None, layer: Layer) -> tuple[None, Array]:
         return carry, _shade(arena.handedness, eye, pixels, layer, bands)
 
-    (first, second, third), _ = scan(insert, nearest, prisms)
+    (first, second, third), _ = way.scan(insert, nearest, prisms)
     behind_two = jnp.where(second.nearness > background, room.behind_two, room.behind_one)
     rest = jnp.where(third.nearness > background, room.behind_three, behind_two)
     rest = rest + third.cover * (third.grey - rest)
     # What the first layer leaves of a pixel has its middle opposite.
     opposite = edges.once(-first.cover / (1.001 - first.cover))
     shift = first.shift[0] * opposite, first.shift[1] * opposite
-    _, (nearer, farther) = scan(shade, None, [first, second._replace(shift=shift)])
+    _, (nearer, farther) = way.scan(shade, None, [first, second._replace(shift=shift)])
     return rest + second.cover * (1.0 - first.cover) * (farther - rest) + first.cover * (nearer - rest)
 
 
@@ -101,6 +114,20 @@ def _unrolled(body: Callable, carry: Any, inputs: list) -> tuple[Any, list]:
 def _scanned(body: Callable, carry: Any, inputs: list) -> tuple[Any, Any]:
     """`lax.scan` over a list, whose reverse mode remembers nothing but the carries."""
     return lax.scan(jax.checkpoint(body), carry, jax.tree.map(lambda *leaves: jnp.stack(leaves), *inputs))
+
+
+def _written(arrays: Any, eye: Array) -> Any:
+    """Have XLA write arrays to memory, and on the way back what it knows of them.
+
+    Each of the many loops that read one would else compute it anew, with all that it comes from. A division is never
+    repeated, and that this one is by 1 is not known before the eye is.
+    """
+    one = 1.0 + 0.0 * lax.stop_gradient(eye[0])
+    return jax.tree.map(lambda a: a / one, arrays)
+
+
+_AT_ONCE = _Way(_unrolled, lambda arrays, _: arrays)
+_IN_STEPS = _Way(_scanned, _written)
 
 
 class _Plain(NamedTuple):
@@ -124,14 +151,14 @@ def _plain(layer: Layer) -> _Plain:
     return _Plain(layer.nearness, layer.cover, layer.texture.brightness)
 
 
-def _prism(prism: Silhouette, pixels: edges.Rays) -> Layer:
+def _prism(prism: Silhouette, pixels: edges.Rays, keep: Keep) -> Layer:
     """What a prism covers of each pixel, and with which face."""
     d, (across_x, across_y) = pixels.d, pixels.across
     beyond = (prism.open - 0.5) * _OPEN
-    left = edges.part(prism.left[0] * across_x + prism.left[1] * across_y + beyond, pixels.slant)
-    right = edges.part(prism.right[0] * across_x + prism.right[1] * across_y + beyond, pixels.slant)
+    margins = keep([n[0] * across_x + n[1] * across_y + beyond for n in (prism.left, prism.right)])
+    left, right = (edges.part(margin, pixels.slant) for margin in margins)
     by_side = 0.5 * (right - left)
-    near, far = _sides(prism, pixels, by_side)
+    near, far = keep(_sides(prism, pixels, by_side))
     side = edges.slopes(near, pixels)
     # From within its wedge a prism can be entered by its lid only, and only the lid ends.
     within, lidless = prism.open > 0.75, prism.lid == 0
@@ -150,7 +177,8 @@ def _prism(prism: Silhouette, pixels: edges.Rays) -> Layer:
     by_lid = on_lid < side[0] + jnp.where(lidless, -_OPEN, jnp.where(within, _OPEN, 0.0))
     s = (jnp.where(by_lid, 0.0, near[0]), jnp.where(by_lid, 0.0, near[1]), jnp.where(by_lid, prism.lid, 0.0))
     nearness = jnp.where(cover > 0, jnp.where(by_lid, on_lid, side[0]), -1.0)
-    return Layer(nearness, cover, (shift_u, shift_v), s, prism.centre, prism.texture)
+    nearness, cover, shift, s = keep((nearness, cover, (shift_u, shift_v), s))
+    return Layer(nearness, cover, shift, s, prism.centre, prism.texture)
 
 
 def _sides(prism: Silhouette, pixels: edges.Rays, shift: Array) -> tuple[Pair, Pair]:
@@ -209,10 +237,10 @@ class _Room(NamedTuple):
     """Mean grey of the room, if three are."""
 
 
-def _room(arena: Arena, eye: Array, pixels: edges.Rays) -> _Room:
+def _room(arena: Arena, eye: Array, pixels: edges.Rays, keep: Keep) -> _Room:
     """Draw the room without obstacles: wall or floor, whichever has more of the pixel, then what it shares it with."""
     by_x, along_x, along_y = _walls(arena, eye, pixels.d)
-    wall_s, other_s = choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)
+    wall_s, other_s = keep((choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)))
     slopes = edges.slopes(wall_s, pixels)
     part, corner_shift = _part_of_nearer(wall_s, other_s, pixels)
     floor, floor_shift = edges.part_below(-eye[2], slopes, pixels)

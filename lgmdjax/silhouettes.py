@@ -113,9 +113,8 @@ def pick(silhouettes: Silhouette, shows: Array, slots: int) -> list[Silhouette]:
     numbers = jnp.arange(1, min(slots, count) + 1, dtype=table.dtype)[:, None]
     chosen = jnp.where((number[:, None] == numbers) & shows[:, None], 1.0, 0.0).astype(table.dtype)
     picked = jnp.einsum("tkn,nf->tkf", chosen, table, precision=lax.Precision.HIGHEST)
-    return [
-        jax.tree.unflatten(structure, [picked[:, k, i] for i in range(len(leaves))]) for k in range(numbers.shape[0])
-    ]
+    fields = lax.split(picked, [1] * len(leaves), axis=2)  # indexed one by one, each would be padded on the way back
+    return [jax.tree.unflatten(structure, [field[:, k, 0] for field in fields]) for k in range(numbers.shape[0])]
 
 
 def _of_boxes(boxes: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:

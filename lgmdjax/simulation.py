@@ -11,6 +11,7 @@ not finite, or that fell over, is frozen where it was and flagged by `ok`; nothi
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -222,15 +223,15 @@ def look(
 ) -> Float[Array, "2 height columns"]:
     """Draw what both eyes see from a pose of the trunk, in grey levels 0..255; black without `draw`.
 
-    Given `draw` as an array, the choice is made at run time, so that one program serves walks with and without
-    pictures, and the drawing is compiled by itself. XLA would else draw anew inside each of the loops that read the
-    picture, and round differently in each program.
+    The choice is made at run time, also where it is known before, so that the drawing is compiled by itself. XLA would
+    else draw anew inside each of the loops that read the picture, and round differently in each program. Given as an
+    array, one program serves walks with and without pictures.
     """
-    return jax.lax.cond(
-        draw,
-        lambda: camera.render(eyes, scene, *hexapod.eye_poses(pose)),
-        lambda: jnp.zeros(camera.shape(eyes), pose.position.dtype),
-    )
+    dark = jnp.zeros(camera.shape(eyes), pose.position.dtype)
+    if draw is False:
+        return dark
+    unknown = jax.lax.optimization_barrier(jnp.asarray(draw))
+    return jax.lax.cond(unknown, lambda: camera.render(eyes, scene, *hexapod.eye_poses(pose)), lambda: dark)
 
 
 def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tuple[State, Float[Array, "2"]]:
@@ -246,6 +247,7 @@ def move(params: Params, model: mjx.Model, scene: arena.Arena, state: State) -> 
     model = hexapod.place_obstacles(model, scene, state.data)
     interval = 1 / (FRAME_RATE * SUBSTEPS)
 
+    @partial(jax.checkpoint, prevent_cse=False)  # to keep its inside for the way back would take longer
     def substep(carry, _):
         data, nerves = carry
         nerves, targets = controller.move(params.controller, nerves, interval)

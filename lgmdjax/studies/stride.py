@@ -26,7 +26,7 @@ Writes stride.json (a row a method and start), and shaping-<method>-<start>.safe
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,8 +69,9 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Stride, seed
     legs, model = strides.before(robot.shaping), hexapod.build()
     rows = [{"method": "before", "start": 0, "curve": []} | measure(legs)]
     for method in METHODS:
+        follow = follower(legs, model, settings, method)
         for start in range(settings.seeds):
-            fitted, curve, seconds = fit(legs, model, settings, method, seed + start)
+            fitted, curve, seconds = fit(legs, model, follow, settings, seed + start)
             name = folder / f"shaping-{method}-{start}.safetensors"
             shaping.save(name, strides.parts(fitted)[1], {"cycle_time": float(fitted.cycle_time), "seed": seed + start})
             row = {"method": method, "start": start, "curve": curve, "seconds": seconds}
@@ -90,13 +91,22 @@ def cost(course: Course, velocity: Float[Array, "2"], first: Course) -> Float[Ar
     )
 
 
-def fit(
-    legs: Legs, model: mjx.Model, settings: scales.Stride, method: str, seed: int
-) -> tuple[Legs, list[list[float]], float]:
-    """Follow one method's slopes; give the legs, the curve (simulated robot-seconds, loss), and the seconds it took."""
-    window, key = round(settings.window / treadmill.STEP), jax.random.key(seed)
+@dataclass(frozen=True, kw_only=True)
+class Follower:
+    """A method, compiled once for all starts."""
+
+    label: str
+    robot_seconds: float  # that a step takes
+    steps: int
+    sizes: Legs  # in shares of which legs are changed
+    optimiser: optax.GradientTransformation
+    update: Callable[..., tuple[Legs, Any, Task, Float[Array, ""]]]
+
+
+def follower(legs: Legs, model: mjx.Model, settings: scales.Stride, method: str) -> Follower:
+    """Prepare to follow one method's slopes from legs."""
+    window, robots = round(settings.window / treadmill.STEP), ROBOTS * len(COMMANDS)
     sizes = jax.tree.map(lambda leaf: jnp.sqrt(jnp.mean(leaf**2)), legs)
-    began = tasks(legs, model, key, window)
 
     def loss(scaled: Legs, task: Task) -> tuple[Float[Array, ""], Walker]:
         own = jax.tree.map(jnp.multiply, scaled, sizes)
@@ -105,7 +115,7 @@ def fit(
         return jnp.where(sound, cost(course, task.velocity, task.first), jnp.nan), end
 
     slope = METHODS[method](loss, settings.pairs)
-    each = len(began.velocity) * settings.window * (1 if method == "gradient" else 2 * settings.pairs)
+    each = robots * settings.window * (1 if method == "gradient" else 2 * settings.pairs)
     steps = round(settings.robot_seconds / each)
     optimiser = optax.chain(
         optax.clip_by_global_norm(settings.clip),
@@ -113,17 +123,28 @@ def fit(
     )
 
     @jax.jit
-    def update(scaled: Legs, state: Any, tasks: Task, key: Array):
-        value, slopes, ends = slope(scaled, tasks, key)
+    def update(scaled: Legs, state: Any, here: Task, began: Task, key: Array):
+        value, slopes, ends = slope(scaled, here, key)
         changes, state = optimiser.update(slopes, state)
-        return jax.tree.map(jnp.add, scaled, changes), state, going_on(tasks, ends, began), value
+        return jax.tree.map(jnp.add, scaled, changes), state, going_on(here, ends, began), value
 
-    scaled = jax.tree.map(jnp.divide, legs, sizes)
-    state, curve, here, clock = optimiser.init(scaled), [], began, time.monotonic()
-    for number in tqdm(range(steps), desc=f"{method}, start {seed}", unit="step"):
-        scaled, state, here, value = update(scaled, state, here, jax.random.fold_in(key, number))
-        curve.append([each * (number + 1), float(value)])
-    return jax.tree.map(jnp.multiply, scaled, sizes), curve, time.monotonic() - clock
+    return Follower(label=method, robot_seconds=each, steps=steps, sizes=sizes, optimiser=optimiser, update=update)
+
+
+def fit(
+    legs: Legs, model: mjx.Model, follow: Follower, settings: scales.Stride, seed: int
+) -> tuple[Legs, list[list[float]], float]:
+    """Follow the slopes from one start; give the legs, the curve (simulated robot-seconds, loss), and its seconds."""
+    key = jax.random.key(seed)
+    began = tasks(legs, model, key, round(settings.window / treadmill.STEP))
+    scaled = jax.tree.map(jnp.divide, legs, follow.sizes)
+    state, curve, here, clock = follow.optimiser.init(scaled), [], began, time.monotonic()
+    for number in tqdm(range(follow.steps), desc=f"{follow.label}, start {seed}", unit="step"):
+        # By way of the host: what was laid out over the devices of the crowd would be another program's.
+        scaled, state = jax.device_get((scaled, state))
+        scaled, state, here, value = follow.update(scaled, state, here, began, jax.random.fold_in(key, number))
+        curve.append([follow.robot_seconds * (number + 1), float(value)])
+    return jax.tree.map(jnp.multiply, scaled, follow.sizes), curve, time.monotonic() - clock
 
 
 def tasks(legs: Legs, model: mjx.Model, key: Array, window: int) -> Task:
