@@ -4,8 +4,9 @@
 
 The robot that comes along walks in random rooms, its thresholds smooth, its pictures of 80 x 60. Timed, a robot and
 frame, are the walk, its loss and nothing else; `imitation.gradient`, which walks each frame again on the way back
-(remat); and the same with the inside of every frame kept instead. All windows are of the longest of `--frames`, and
-the middle of the crowds takes the shorter ones too. Memory is what XLA sets aside for a program's own use.
+(remat); and the same with what a frame computes outside its physics steps kept instead. All windows are of the longest
+of `--frames`, and the middle of the crowds takes the shorter ones too. Memory is what XLA sets aside for a program's
+own use.
 
 Beside it what one would do without reverse mode: a slope in one direction by forward mode, and differences to both
 sides of every number that can be tuned, which are not run: each is two walks, and walks are timed.
@@ -124,17 +125,24 @@ def program(kind: Kind) -> Any:
         *,
         settings: imitation.Settings,
     ) -> Any:
-        def one(room: simulation.Room, state: simulation.State) -> Any:
-            def loss(nerves: controller.Params) -> Any:
-                return imitation.loss(nerves, params, model, room, state, settings)
+        def share(rooms: simulation.Room, states: simulation.State) -> Any:
+            robots = rooms.starts.shape[0]
 
-            if kind == "walk":
-                return loss(params.controller)
-            along = jax.tree.map(lambda size, leaf: jnp.broadcast_to(size, leaf.shape), sizes, params.controller)
-            value, slope, rest = jax.jvp(loss, (params.controller,), (along,), has_aux=True)
+            def losses(nerves: controller.Params) -> Any:
+                return imitation.losses(nerves, params, model, rooms, states, settings)
+
+            def frame(room: simulation.Room, state: simulation.State, _: None) -> Any:
+                return simulation.step(params, model, room, state, drivers.LEARNED, settings.draw)
+
+            if kind == "walk":  # by the same nerves for all
+                after, record = rollout.march(frame, rooms, states, length=settings.frames)
+                return jnp.mean((record.velocity - record.label) ** 2, axis=(1, 2)), (after, record)
+            nerves = imitation.each_its_own(params.controller, robots)
+            along = jax.tree.map(lambda size, leaf: jnp.broadcast_to(size, jnp.shape(leaf)), sizes, params.controller)
+            value, slope, rest = jax.jvp(losses, (nerves,), (imitation.each_its_own(along, robots),), has_aux=True)
             return (value, slope), rest
 
-        found, (states, record) = rollout.deal(jax.vmap(one), rooms, states)
+        found, (states, record) = rollout.deal(share, rooms, states)
         return found, states, record
 
     return window

@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from scipy import ndimage
 
 from lgmdjax import arena, camera, lgmd, redraw, rollout
@@ -68,6 +68,7 @@ def grid(thresholds: Sequence[float] = THRESHOLDS, inhibitions: Sequence[float] 
     return Candidates(threshold=pairs[:, 1], inhibition=pairs[:, 0])
 
 
+@partial(jax.jit, static_argnames="eyes")
 def survey(
     params: lgmd.Params, eyes: camera.Params, arenas: arena.Arena, record: Record, candidates: Candidates
 ) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
@@ -75,20 +76,6 @@ def survey(
 
     The eyes open on the first picture, and anew wherever the robot was put down.
     """
-    # Told at run time, so that pictures are drawn once and not in every loop that reads them: `simulation.look`.
-    return _survey(params, eyes, arenas, record, candidates, draw=True)
-
-
-@partial(jax.jit, static_argnames="eyes")
-def _survey(
-    params: lgmd.Params,
-    eyes: camera.Params,
-    arenas: arena.Arena,
-    record: Record,
-    candidates: Candidates,
-    *,
-    draw: Bool[Array, ""] | bool,
-) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
 
     def see(candidate: Candidates, state: lgmd.State, picture: Array) -> tuple[lgmd.State, Array, Array]:
         chosen = {"threshold": candidate.threshold, "inhibition": candidate.inhibition, "suppression": jnp.inf}
@@ -102,7 +89,7 @@ def _survey(
 
     def step(room: arena.Arena, state: lgmd.State, row: tuple[Array, ...]):
         fresh, *pose = row
-        pictures = redraw.frame(eyes, room, *pose, draw=draw)
+        pictures = redraw.frame(eyes, room, *pose)
         opened = jax.tree.map(partial(jnp.where, fresh), open_eyes(pictures), state)
         state, u, FF = jax.vmap(see_all, in_axes=(None, 0, 0))(candidates, opened, pictures)
         return state, (u, FF)

@@ -57,7 +57,7 @@ class Settings:
 
     frames: int = 30
     through: Through = "everything"
-    remat: bool = True  # walk each frame again on the way back: its inside need not be kept
+    remat: bool = True  # walk each frame again on the way back: its inside need not be kept; physics steps are anyway
     clip: float = math.inf  # largest norm of one robot's gradient, as a multiple of the crowd's middle one
     draw: bool = True  # what the eyes see; else they stay shut
 
@@ -73,25 +73,34 @@ class Gradient:
     lost: Bool[Array, " robots"]  # whose loss or gradient is not finite: they do not count
 
 
-def loss(
-    nerves: controller.Params, params: Params, model: mjx.Model, room: Room, state: State, settings: Settings
-) -> tuple[Float[Array, ""], tuple[State, Record]]:
-    """Walk one robot for a window; give its loss, the state to go on from, and what the window left behind.
+def losses(
+    nerves: controller.Params, params: Params, model: mjx.Model, rooms: Room, states: State, settings: Settings
+) -> tuple[Float[Array, " robots"], tuple[State, Record]]:
+    """Walk a crowd for a window; give each robot's loss, the states to go on from, and what the window left behind.
 
     Args:
-        nerves: what the derivative is asked of, in place of those in `params`; its driver is a navigator.
-        state: as `simulation.init` or the last window left it.
+        nerves: each robot's own, of which the derivative is asked, in place of those in `params`; the driver is a
+            navigator. states: as `simulation.init` or the last window left them.
     """
-    own = replace(params, controller=nerves)
 
-    def frame(state: State, _: None) -> tuple[State, Record]:
+    def frame(place: tuple[controller.Params, Room], state: State, _: None) -> tuple[State, Record]:
+        own, room = replace(params, controller=place[0]), place[1]
         return simulation.step(own, model, room, state, drivers.LEARNED, settings.draw, settings.through)
 
     # What is walked again is in a loop, where XLA cannot take it for the same as the first time.
     walked = jax.checkpoint(frame, prevent_cse=False) if settings.remat else frame
-    state, record = jax.lax.scan(walked, state, length=settings.frames)
+    states, record = rollout.march(walked, (nerves, rooms), states, length=settings.frames)
     error = jnp.mean((record.velocity - record.label) ** 2, axis=-1)
-    return jnp.mean(jnp.where(record.ok, error, 0.0)), (state, record)
+    return jnp.mean(jnp.where(record.ok, error, 0.0), axis=-1), (states, record)
+
+
+def loss(
+    nerves: controller.Params, params: Params, model: mjx.Model, room: Room, state: State, settings: Settings
+) -> tuple[Float[Array, ""], tuple[State, Record]]:
+    """Walk one robot, as `losses` does a crowd."""
+    nerves, room, state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (nerves, room, state))
+    found, rest = losses(nerves, params, model, room, state, settings)
+    return found[0], jax.tree.map(lambda leaf: leaf[0], rest)
 
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="states")
@@ -107,17 +116,20 @@ def gradient(
         states: from `rollout.start`, or as the last window left them; they are used up.
         sizes: of the nerves' parameters, in which the gradient is measured; zero for what it leaves out.
     """
-    slopes = jax.value_and_grad(loss, has_aux=True)
 
     def share(rooms: Room, states: State) -> tuple[Any, Any]:
-        return jax.vmap(lambda room, state: slopes(params.controller, params, model, room, state, settings))(
-            rooms, states
-        )
+        def total(nerves: controller.Params) -> tuple[Float[Array, ""], Any]:
+            found, rest = losses(nerves, params, model, rooms, states, settings)
+            return jnp.sum(found), (found, rest)
 
-    (losses, (states, record)), each = rollout.deal(share, rooms, states)
+        # Robots are apart: by each one's own nerves, the slope of the sum is that of its loss.
+        slopes, found = jax.grad(total, has_aux=True)(each_its_own(params.controller, rooms.starts.shape[0]))
+        return found, slopes
+
+    (costs, (states, record)), each = rollout.deal(share, rooms, states)
     each = jax.tree.map(jnp.multiply, each, sizes)
     norms: Array = jax.vmap(optax.tree.norm)(each)
-    lost = ~(jnp.isfinite(losses) & jnp.isfinite(norms))
+    lost = ~(jnp.isfinite(costs) & jnp.isfinite(norms))
     count = jnp.maximum(jnp.sum(~lost), 1)
     scale = jnp.where(lost, 0.0, _cut(norms, lost, settings.clip)) / count
 
@@ -129,8 +141,13 @@ def gradient(
     # The variance of a mean: what its robots' squares have more than its own.
     squares = count * jnp.sum((scale * jnp.where(lost, 0.0, norms)) ** 2)
     noise = jnp.sqrt(jnp.maximum(squares - optax.tree.norm(slope, squared=True), 0.0) / jnp.maximum(count - 1, 1))
-    found = Gradient(loss=jnp.sum(losses, where=~lost) / count, slope=slope, norms=norms, noise=noise, lost=lost)
+    found = Gradient(loss=jnp.sum(costs, where=~lost) / count, slope=slope, norms=norms, noise=noise, lost=lost)
     return found, states, record
+
+
+def each_its_own(nerves: controller.Params, robots: int) -> controller.Params:
+    """Copy nerves for each robot of a crowd."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *jnp.shape(leaf))), nerves)
 
 
 def _cut(norms: Float[Array, " robots"], lost: Bool[Array, " robots"], clip: float) -> Float[Array, " robots"]:

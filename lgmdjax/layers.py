@@ -56,8 +56,9 @@ class Layer(NamedTuple):
 def draw(arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette], bands: int) -> Array:
     """Blend the two nearest layers of every pixel over the mean grey of the third and of what is behind that.
 
-    Gradient: that of the same drawing with its loops as `lax.scan`. Unrolled they are one expression, the fastest to
-    evaluate, but its derivative would take minutes to compile.
+    Gradient: that of the same drawing with its loops as `lax.scan`, and with what many loops read written down.
+    Unrolled they are one expression, the fastest to evaluate, but its derivative would take minutes to compile. The
+    picture itself is the fast drawing's, with a derivative or without.
     """
     return _draw(_AT_ONCE, arena, eye, pixels, prisms, bands)
 
@@ -65,7 +66,7 @@ def draw(arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette],
 @draw.defjvp
 def _draw_jvp(bands: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     _, slope = jax.jvp(functools.partial(_draw, _IN_STEPS, bands=bands), primals, tangents)
-    return draw(*primals, bands), slope  # where both are wanted, too, what is seen is the fast drawing
+    return draw(*primals, bands), slope
 
 
 class _Way(NamedTuple):

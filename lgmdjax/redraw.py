@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from lgmdjax import arena, camera, hexapod, rollout, simulation
 from lgmdjax.simulation import Leaf, Record
@@ -31,22 +31,17 @@ def walks(
     parts = []
     for first in range(0, frames, FRAMES):
         these = np.minimum(np.arange(first, first + FRAMES), frames - 1)
-        pictures = _frames(eyes, rooms, *(leaf[:, these] for leaf in poses), draw=True)
+        pictures = _frames(eyes, rooms, *(leaf[:, these] for leaf in poses))
         parts.append(np.asarray(pictures)[:, : frames - first])
     return np.concatenate(parts, axis=1)
 
 
 @partial(jax.jit, static_argnames="eyes")
-def _frames(
-    eyes: camera.Params, rooms: arena.Arena, *poses: Leaf, draw: Bool[Array, ""] | bool
-) -> Float[Array, "robots frames 2 height columns"]:
-    """Draw as `rollout.advance` does: in a loop over frames, where `draw` is known at run time only.
-
-    Where the compiler knows more, it computes what it can beforehand, and comes to other last bits.
-    """
+def _frames(eyes: camera.Params, rooms: arena.Arena, *poses: Leaf) -> Float[Array, "robots frames 2 height columns"]:
+    """Draw as `rollout.advance` does, in a loop over frames: it comes to the same last bits."""
 
     def step(room: arena.Arena, _: None, pose: tuple[Leaf, Leaf, Leaf]) -> tuple[None, Array]:
-        return None, frame(eyes, room, *pose, draw=draw)
+        return None, frame(eyes, room, *pose)
 
     return rollout.deal(lambda rooms, *poses: rollout.march(step, rooms, None, poses)[1], rooms, *poses)
 
@@ -57,8 +52,7 @@ def frame(
     time: Float[Leaf, ""],
     position: Float[Leaf, "3"],
     quaternion: Float[Leaf, "4"],
-    draw: Bool[Array, ""] | bool = True,
 ) -> Float[Array, "2 height columns"]:
     """Draw what both eyes see from a pose of the trunk [m, 1], at a time [s] that tells where moving things are."""
     pose = hexapod.Pose(position=jnp.asarray(position), quaternion=jnp.asarray(quaternion))
-    return simulation.look(eyes, arena.at(room, jnp.asarray(time)), pose, draw)
+    return simulation.look(eyes, arena.at(room, jnp.asarray(time)), pose)

@@ -26,7 +26,7 @@ def before_a_corner(key: jax.Array) -> arena.Arena:
 
 
 def in_the_testing_room(key: jax.Array) -> arena.Arena:
-    """Fig. 13's room, the robot put down nearer to the box in its middle: 30 s must do."""
+    """Fig. 13's room, the robot put down nearer to the box in its middle, for short walks."""
     return replace(scenes.testing_room(key), start=jax.numpy.array([0.1, 1.4, -0.5 * np.pi]))
 
 

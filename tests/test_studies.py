@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import synthetic
 from scipy.spatial.transform import Rotation
+from slopes import Routes
 
 from lgmdjax import (
     arena,
@@ -264,6 +265,21 @@ def test_fitted_legs_start_as_those_that_come_along_and_walk_mirrored():
     there = shaping.shape(networks, signal, jnp.asarray([1.3, 0.4]))
     mirrored = shaping.shape(networks, signal[::-1], jnp.asarray([0.4, 1.3]))
     np.testing.assert_allclose(mirrored, there[::-1] * np.array([-1.0, 1.0, 1.0]), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_window_has_one_derivative_by_three_routes():
+    """Of all that it is measured by, from the middle of a step: by networks, cycle time and couplings."""
+    legs, model = strides.before(shaping.taught()), hexapod.softened(hexapod.build())
+    walker, velocity = jax.jit(strides.start)(legs, model, 0.15), jnp.asarray([1.2, 0.8])
+
+    def measured(legs):
+        course, _ = strides.walk(legs, model, walker, velocity, 24)
+        return 20 * course.speed + course.turn + course.sway + course.effort
+
+    routes = Routes(measured)
+    routes.assert_agree(legs)
+    routes.assert_every_leaf_agrees(legs)
 
 
 def test_evolution_estimates_the_slope_that_reverse_mode_takes():

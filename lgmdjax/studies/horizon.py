@@ -1,7 +1,7 @@
 """How far back is a derivative worth taking? The closed-loop imitation loss, against the frames that it goes through.
 
-A robot walks towards a box for `FRAMES` frames, its parameters those of the controller throughout; the loss is that of
-the last frames, and so is the derivative: what the parameters did before does not count. With the number of those
+Robots walk in random rooms for `FRAMES` frames, their parameters those of the controller throughout; the loss is that
+of the last frames, and so is the derivative: what the parameters did before does not count. With the number of those
 frames, the horizon, its norm grows as the walk is sensitive to what was done long ago, and what float32 knows of it
 shrinks.
 
@@ -25,11 +25,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 from mujoco import mjx
 
-from lgmdjax import controller, drivers, figures, files, hexapod, imitation, scales, simulation
+from lgmdjax import controller, drivers, figures, files, hexapod, imitation, rollout, scales, simulation
 from lgmdjax.stages import crew
 
 FRAMES = 150
@@ -49,74 +50,101 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Horizon, see
             rooms = crew.rooms_of(seed, 0, settings.robots)
             models = {"hard": hexapod.build(), "soft": hexapod.softened(hexapod.build())}
             for contact in CONTACTS:
-                for number in range(settings.robots):
-                    room = jax.tree.map(lambda leaf, number=number: leaf[number], rooms)
-                    found = slopes(robot, models[contact], room, seed, differ=precision == "float64")
-                    facts = {"contact": contact, "precision": precision, "robot": number}
-                    rows += [facts | row for row in found]
+                print(f"{contact} contacts, {precision}", flush=True)
+                facts = {"contact": contact, "precision": precision}
+                found = slopes(robot, models[contact], rooms, seed, differ=precision == "float64")
+                rows += [facts | row for row in found]
     files.write_json(folder / "horizon.json", rows)
 
 
 def slopes(
-    robot: simulation.Params, model: mjx.Model, room: simulation.Room, seed: int, differ: bool
+    robot: simulation.Params, model: mjx.Model, rooms: simulation.Room, seed: int, differ: bool
 ) -> list[dict[str, Any]]:
-    """Walk one robot, and take the derivative at every horizon by three routes."""
+    """Walk a robot in each room, and take the derivative at every horizon by three routes; a row a horizon and room."""
     sizes = jax.tree.map(lambda leaf: jnp.sqrt(jnp.mean(leaf**2)) + 1e-6, robot.controller)
     keys = jax.random.split(jax.random.key(seed), len(jax.tree.leaves(sizes)))
     drawn = [
-        jax.random.normal(key, leaf.shape, jnp.float32).astype(leaf.dtype)
+        jax.random.normal(key, jnp.shape(leaf), jnp.float32).astype(leaf.dtype)
         for key, leaf in zip(keys, jax.tree.leaves(robot.controller), strict=True)
     ]
     along = jax.tree.unflatten(jax.tree.structure(robot.controller), drawn)
-    nothing = jax.tree.map(jnp.zeros_like, robot.controller)
-    reverse, forward = _programs()
     rows = []
     for horizon in HORIZONS:
-        ask = (robot, model, room, sizes, jnp.asarray(horizon))
-        value, gradient = reverse(nothing, *ask)
-        slope = float(sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient, along))))
-        row = {"horizon": horizon, "loss": float(value), "slope": slope}
-        row["norm"] = float(jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient))))
-        row["forward"] = float(forward(nothing, along, *ask)[1])
+        ask = (robot, model, rooms, sizes, jnp.asarray(horizon))
+        values, gradients = jax.device_get(reverse(*ask))
+        columns = {
+            "loss": values,
+            "slope": sum(
+                np.sum(leaf * np.asarray(by), axis=tuple(range(1, np.ndim(leaf))))
+                for leaf, by in zip(jax.tree.leaves(gradients), drawn, strict=True)
+            ),
+            "norm": jax.vmap(optax.tree.norm)(gradients),
+            "forward": forward(0.0, along, *ask)[1],
+        }
         if differ:
-            ends = [
-                float(forward(jax.tree.map(lambda dx, by=by: by * dx, along), along, *ask)[0]) for by in (STEP, -STEP)
-            ]
-            row["difference"] = (ends[0] - ends[1]) / (2 * STEP)
-        rows.append(row)
+            above, below = (np.asarray(forward(by, along, *ask)[0]) for by in (STEP, -STEP))
+            columns["difference"] = (above - below) / (2 * STEP)
+        table = {name: np.asarray(column).tolist() for name, column in columns.items()}
+        rows += [
+            {"horizon": horizon, "robot": number} | {name: column[number] for name, column in table.items()}
+            for number in range(len(values))
+        ]
     return rows
 
 
-def _programs():
-    """Compile the loss's gradient and its slope: once for all horizons, which are numbers."""
-    return jax.jit(jax.value_and_grad(loss)), jax.jit(
-        lambda shift, along, *ask: jax.jvp(lambda shift: loss(shift, *ask), (shift,), (along,))
-    )
+@jax.jit
+def reverse(*ask: Any) -> tuple[Float[Array, " rooms"], controller.Params]:
+    """Take each room's loss, and its gradient by shares of the parameters' sizes, by reverse mode."""
+    robot, model, rooms, sizes, horizon = ask
+
+    def share(rooms: simulation.Room) -> tuple[Array, controller.Params]:
+        def total(shift: controller.Params) -> tuple[Array, Array]:
+            found = losses(shift, robot, model, rooms, sizes, horizon)
+            return jnp.sum(found), found
+
+        nothing = jax.tree.map(jnp.zeros_like, robot.controller)
+        each, found = jax.grad(total, has_aux=True)(imitation.each_its_own(nothing, rooms.starts.shape[0]))
+        return found, each
+
+    return rollout.deal(share, rooms)
 
 
-def loss(
+@jax.jit
+def forward(by: Float[Array, ""] | float, along: controller.Params, *ask: Any) -> tuple[Array, Array]:
+    """Take each room's loss, the nerves shifted by so much along a direction, and its slope there, by forward mode."""
+    robot, model, rooms, sizes, horizon = ask
+
+    def share(rooms: simulation.Room) -> tuple[Array, Array]:
+        directions = imitation.each_its_own(along, rooms.starts.shape[0])
+        shift = jax.tree.map(lambda dx: by * dx, directions)
+        return jax.jvp(lambda shift: losses(shift, robot, model, rooms, sizes, horizon), (shift,), (directions,))
+
+    return rollout.deal(share, rooms)
+
+
+def losses(
     shift: controller.Params,
     robot: simulation.Params,
     model: mjx.Model,
-    room: simulation.Room,
+    rooms: simulation.Room,
     sizes: controller.Params,
     horizon: Array,
-) -> Float[Array, ""]:
-    """Sum up the imitation loss of the last frames, the nerves shifted for as long by shares of their size."""
+) -> Float[Array, " rooms"]:
+    """Sum up the imitation loss of the last frames, each robot's nerves shifted for as long by shares of their size."""
 
     @partial(jax.checkpoint, prevent_cse=False)
-    def frame(state: simulation.State, number: Array):
-        live = FRAMES - number <= horizon
+    def frame(place: tuple[controller.Params, simulation.Room], state: simulation.State, _: None):
+        late = FRAMES - state.frame <= horizon
         nerves = jax.tree.map(
-            lambda leaf, dx, size: leaf + jnp.where(live, dx, 0.0) * size, robot.controller, shift, sizes
+            lambda leaf, dx, size: leaf + jnp.where(late, dx, 0.0) * size, robot.controller, place[0], sizes
         )
         own = replace(robot, controller=nerves)
-        state, record = simulation.step(own, model, room, state, drivers.LEARNED)
-        return state, jnp.where(live, jnp.mean((record.velocity - record.label) ** 2), 0.0)
+        after, record = simulation.step(own, model, place[1], state, drivers.LEARNED)
+        return after, jnp.where(late, jnp.mean((record.velocity - record.label) ** 2), 0.0)
 
-    start = simulation.init(robot, model, room, drivers.LEARNED)
-    _, errors = jax.lax.scan(frame, start, jnp.arange(FRAMES))
-    return jnp.sum(errors) / horizon
+    start = jax.vmap(lambda room: simulation.init(robot, model, room, drivers.LEARNED))(rooms)
+    _, errors = rollout.march(frame, (shift, rooms), start, length=FRAMES)
+    return jnp.sum(errors, axis=1) / horizon
 
 
 @figures.styled

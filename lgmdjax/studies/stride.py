@@ -68,14 +68,16 @@ def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Stride, seed
     robot = crew.trained(inputs["fit-gait"], inputs["train"]).controller
     legs, model = strides.before(robot.shaping), hexapod.build()
     rows = [{"method": "before", "start": 0, "curve": []} | measure(legs)]
+    window = round(settings.window / treadmill.STEP)
+    crowds = [tasks(legs, model, jax.random.key(seed + start), window) for start in range(settings.seeds)]
     for method in METHODS:
         follow = follower(legs, model, settings, method)
-        for start in range(settings.seeds):
-            fitted, curve, seconds = fit(legs, model, follow, settings, seed + start)
+        for start, began in enumerate(crowds):
+            fitted, curve, seconds = fit(legs, follow, began, seed + start)
             name = folder / f"shaping-{method}-{start}.safetensors"
-            shaping.save(name, strides.parts(fitted)[1], {"cycle_time": float(fitted.cycle_time), "seed": seed + start})
-            row = {"method": method, "start": start, "curve": curve, "seconds": seconds}
             numbers = {name: float(getattr(fitted, name)) for name in ("cycle_time", "within", "across")}
+            shaping.save(name, strides.parts(fitted)[1], numbers | {"seed": seed + start})
+            row = {"method": method, "start": start, "curve": curve, "seconds": seconds}
             rows.append(row | numbers | measure(fitted))
     files.write_json(folder / "stride.json", rows)
 
@@ -131,13 +133,12 @@ def follower(legs: Legs, model: mjx.Model, settings: scales.Stride, method: str)
     return Follower(label=method, robot_seconds=each, steps=steps, sizes=sizes, optimiser=optimiser, update=update)
 
 
-def fit(
-    legs: Legs, model: mjx.Model, follow: Follower, settings: scales.Stride, seed: int
-) -> tuple[Legs, list[list[float]], float]:
-    """Follow the slopes from one start; give the legs, the curve (simulated robot-seconds, loss), and its seconds."""
-    key = jax.random.key(seed)
-    began = tasks(legs, model, key, round(settings.window / treadmill.STEP))
-    scaled = jax.tree.map(jnp.divide, legs, follow.sizes)
+def fit(legs: Legs, follow: Follower, began: Task, seed: int) -> tuple[Legs, list[list[float]], float]:
+    """Follow the slopes from one start; give the legs, the curve (simulated robot-seconds, loss), and its seconds.
+
+    The first start's seconds have the compilation in them.
+    """
+    key, scaled = jax.random.key(seed), jax.tree.map(jnp.divide, legs, follow.sizes)
     state, curve, here, clock = follow.optimiser.init(scaled), [], began, time.monotonic()
     for number in tqdm(range(follow.steps), desc=f"{follow.label}, start {seed}", unit="step"):
         # By way of the host: what was laid out over the devices of the crowd would be another program's.
