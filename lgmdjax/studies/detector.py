@@ -254,5 +254,5 @@ def _kernel(axes: Axes, found: Sequence[Mapping[str, Any]], title: str) -> None:
         "–".join(dict.fromkeys(f"{end([one[name] for one in found]):.2g}" for end in (min, max)))
         for name in sight.SCALARS
     )
-    axes.set_title(f"{title}\n$T_s$ {T_s}, $T_f$ {T_f}, $W_I$ {W_I}", fontsize=7.5)
+    axes.set_title(f"{title}\n$T_s$ {T_s}, $T_f$ {T_f}\n$W_I$ {W_I}", fontsize=7.5)
     axes.set_axis_off()
