@@ -187,6 +187,7 @@ def main(robots: tuple[int, ...] = (1, 16, 64), frames: tuple[int, ...] = (1, 30
         frames: windows
         draw: what the eyes see; without, the gradient is through legs, body and network alone
     """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # for the processes: XLA calls its own tuning flags errors
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco-mjx"))
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, load {load}; {versions}")
