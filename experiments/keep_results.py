@@ -16,7 +16,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.files import read_json, write_json
 
 WALKS = ("*.parquet", "walk.npz", "trajectories.npz", "walks", "episodes")
-LEFT_OUT = (*WALKS, "checkpoints", "pupils", "start-*", ".lock", "*.partial*", "report")
+LEFT_OUT = (*WALKS, "checkpoints", "pupils", "start-*", ".lock", "*.partial*", "report")  # fits and walks of a start
 
 
 def main(run: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
