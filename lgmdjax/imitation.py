@@ -34,6 +34,7 @@ fell counts no longer. Thresholds that are steps have none (`lgmd.Params.smooth`
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -118,13 +119,8 @@ def gradient(
     """
 
     def share(rooms: Room, states: State) -> tuple[Any, Any]:
-        def total(nerves: controller.Params) -> tuple[Float[Array, ""], Any]:
-            found, rest = losses(nerves, params, model, rooms, states, settings)
-            return jnp.sum(found), (found, rest)
-
-        # Robots are apart: by each one's own nerves, the slope of the sum is that of its loss.
-        slopes, found = jax.grad(total, has_aux=True)(each_its_own(params.controller, rooms.starts.shape[0]))
-        return found, slopes
+        nerves = each_its_own(params.controller, rooms.starts.shape[0])
+        return slopes(lambda nerves: losses(nerves, params, model, rooms, states, settings), nerves)
 
     (costs, (states, record)), each = rollout.deal(share, rooms, states)
     each = jax.tree.map(jnp.multiply, each, sizes)
@@ -143,6 +139,22 @@ def gradient(
     noise = jnp.sqrt(jnp.maximum(squares - optax.tree.norm(slope, squared=True), 0.0) / jnp.maximum(count - 1, 1))
     found = Gradient(loss=jnp.sum(costs, where=~lost) / count, slope=slope, norms=norms, noise=noise, lost=lost)
     return found, states, record
+
+
+def slopes(
+    of: Callable[[controller.Params], tuple[Float[Array, " robots"], Any]], nerves: controller.Params
+) -> tuple[tuple[Float[Array, " robots"], Any], controller.Params]:
+    """Give what a crowd's losses and the rest are, and the gradient of each robot's loss by its own nerves.
+
+    Robots are apart: it is that of the sum.
+    """
+
+    def total(nerves: controller.Params) -> tuple[Float[Array, ""], Any]:
+        found, rest = of(nerves)
+        return jnp.sum(found), (found, rest)
+
+    each, found = jax.grad(total, has_aux=True)(nerves)
+    return found, each
 
 
 def each_its_own(nerves: controller.Params, robots: int) -> controller.Params:

@@ -100,12 +100,10 @@ def reverse(*ask: Any) -> tuple[Float[Array, " rooms"], controller.Params]:
     robot, model, rooms, sizes, horizon = ask
 
     def share(rooms: simulation.Room) -> tuple[Array, controller.Params]:
-        def total(shift: controller.Params) -> tuple[Array, Array]:
-            found = losses(shift, robot, model, rooms, sizes, horizon)
-            return jnp.sum(found), found
-
-        nothing = jax.tree.map(jnp.zeros_like, robot.controller)
-        each, found = jax.grad(total, has_aux=True)(imitation.each_its_own(nothing, rooms.starts.shape[0]))
+        nothing = imitation.each_its_own(jax.tree.map(jnp.zeros_like, robot.controller), rooms.starts.shape[0])
+        (found, _), each = imitation.slopes(
+            lambda shift: (losses(shift, robot, model, rooms, sizes, horizon), None), nothing
+        )
         return found, each
 
     return rollout.deal(share, rooms)
