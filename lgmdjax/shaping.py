@@ -84,7 +84,8 @@ def shape(params: Params, rhythm: Float[Array, "6 2"], velocity: Float[Array, "2
 
 def mirror(params: Params) -> Params:
     """Exchange the networks of left and right: what they give is the mirror image."""
-    signs = {"w1": 1.0, "b1": 1.0, "w2": COXA_REVERSED, "b2": COXA_REVERSED}
+    reversed_coxa = jnp.asarray(COXA_REVERSED, dtype=params.w2.dtype)  # the networks keep their precision
+    signs = {"w1": 1.0, "b1": 1.0, "w2": reversed_coxa, "b2": reversed_coxa}
     return replace(params, **{name: getattr(params, name)[::-1] * sign for name, sign in signs.items()})
 
 

@@ -74,19 +74,12 @@ def _measure(folder: Path, name: str, robot: simulation.Params, settings: scales
     return {"case": name, "speed": gauge.speed, "u": calibration.follow(walks["teacher"]), **scored}
 
 
-def _rhythm(**changes: Any) -> Change:
-    def change(robot: simulation.Params, _: Path) -> simulation.Params:
-        changed = {name: value if isinstance(value, bool) else jnp.asarray(value) for name, value in changes.items()}
-        return replace(robot, controller=replace(robot.controller, cpg=replace(robot.controller.cpg, **changed)))
-
-    return change
+def _rhythm(robot: simulation.Params, **changes: Any) -> simulation.Params:
+    return replace(robot, controller=replace(robot.controller, cpg=replace(robot.controller.cpg, **changes)))
 
 
-def _detector(**changes: bool) -> Change:
-    def change(robot: simulation.Params, _: Path) -> simulation.Params:
-        return replace(robot, controller=replace(robot.controller, lgmd=replace(robot.controller.lgmd, **changes)))
-
-    return change
+def _detector(robot: simulation.Params, **changes: bool) -> simulation.Params:
+    return replace(robot, controller=replace(robot.controller, lgmd=replace(robot.controller.lgmd, **changes)))
 
 
 def _literal(robot: simulation.Params, folder: Path) -> simulation.Params:
@@ -104,12 +97,12 @@ def _same_picture(robot: simulation.Params, _: Path) -> simulation.Params:
 
 CASES: Mapping[str, Change] = {
     "all corrected": lambda robot, _: robot,
-    "eqs. 1, 3: sign of w_fe": _rhythm(printed_sign=True),
-    "eqs. 1, 3: coupling W": _rhythm(coupling=cpg.coupling(within_tripod=0.40, across=0.04)),
+    "eqs. 1, 3: sign of w_fe": lambda robot, _: _rhythm(robot, printed_sign=True),
+    "eqs. 1, 3: coupling W": lambda robot, _: _rhythm(robot, coupling=cpg.coupling(within_tripod=0.40, across=0.04)),
     "sec. 3.2: one input a leg": _literal,
     "sec. 3.3: whole pictures": _same_picture,
-    "eq. 15: signed sum": _detector(printed_feed_forward=True),
-    "eq. 16: gate": _detector(printed_gate=True),
+    "eq. 15: signed sum": lambda robot, _: _detector(robot, printed_feed_forward=True),
+    "eq. 16: gate": lambda robot, _: _detector(robot, printed_gate=True),
     "eq. 22: rule alone": lambda robot, _: teaching.under(robot, "eq. 22"),
 }
 
