@@ -134,9 +134,11 @@ def walks(
     robots = rooms.starts.shape[0]
     print(f"{label}: compiling the simulation, then {robots} robots for {seconds:g} s each", flush=True)
     chunks = rollout.chunks(params, model, rooms, drivers.ANYONE, seconds, draw=draw, chunk_seconds=CHUNK)
-    with tqdm(total=robots * seconds, desc=label, unit="robot-s", bar_format=BAR) as bar:
+    # Frames are counted, which are whole: sums of seconds come out beyond the total.
+    frames, second = robots * round(seconds * simulation.FRAME_RATE), 1 / simulation.FRAME_RATE
+    with tqdm(total=frames, desc=label, unit="robot-s", unit_scale=second, bar_format=BAR) as bar:
         for chunk in chunks:
-            bar.update(chunk.time.size / simulation.FRAME_RATE)
+            bar.update(chunk.time.size)
             yield chunk
 
 

@@ -1,17 +1,16 @@
 """How far back is a derivative worth taking? The closed-loop imitation loss, against the frames that it goes through.
 
-Robots walk in random rooms for `FRAMES` frames, their parameters those of the controller throughout; the loss is that
-of the last frames, and so is the derivative: what the parameters did before does not count. With the number of those
-frames, the horizon, its norm grows as the walk is sensitive to what was done long ago, and what float32 knows of it
+Robots walk in random rooms until as many frames before `FRAMES` as the horizon has, once, in double precision. From
+there each walks on with parameters of its own; the loss is that of the frames up to `FRAMES`, and so is the derivative.
+With the horizon its norm grows, as the walk is sensitive to what was done long ago, and what float32 knows of it
 shrinks.
 
-| drawn      | meaning                                                                                        |
-| ---------- | ---------------------------------------------------------------------------------------------- |
-| norm       | of the gradient, in units of the parameters' size, median of the robots; the most and the least |
-| agreement  | of the slope along a random direction, |a - b| / (|a| + |b|), median: of reverse and forward     |
-|            | mode in either precision, of reverse mode and central differences in double precision          |
-
-By the time that a derivative begins, walks in single and in double precision have parted: theirs are not compared.
+| drawn      | meaning                                                                                         |
+| ---------- | ----------------------------------------------------------------------------------------------- |
+| norm       | of the gradient, in units of the parameters' size, median of the robots; the most and the least  |
+| agreement  | of the slope along a random direction, |a - b| / (|a| + |b|), median: of reverse and forward mode |
+|            | and of reverse mode and central differences, both in double precision; and of reverse mode in    |
+|            | single and in double precision, from the same states                                            |
 
 Hard contacts are those of the XML, soft ones `hexapod.softened`. Thresholds are smooth.
 
@@ -45,24 +44,45 @@ PRECISIONS = ("float64", "float32")
 def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Horizon, seed: int) -> None:
     """Take the gradient at every horizon, in rooms of luck, with both kinds of contact and in both precisions."""
     rows = []
-    for precision in PRECISIONS:
-        with jax.enable_x64(precision == "float64"):
+    for contact in CONTACTS:
+        with jax.enable_x64(True):
             robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
             robot = imitation.smooth(imitation.alone(robot))
+            model = hexapod.build() if contact == "hard" else hexapod.softened(hexapod.build())
             rooms = crew.rooms_of(seed, 0, settings.robots)
-            models = {"hard": hexapod.build(), "soft": hexapod.softened(hexapod.build())}
-            for contact in CONTACTS:
-                print(f"{contact} contacts, {precision}", flush=True)
-                facts = {"contact": contact, "precision": precision}
-                found = slopes(robot, models[contact], rooms, seed, differ=precision == "float64")
-                rows += [facts | row for row in found]
+            crowd = _on_host((robot, model, rooms, before(robot, model, rooms)))
+        for precision in PRECISIONS:
+            print(f"{contact} contacts, {precision}", flush=True)
+            with jax.enable_x64(precision == "float64"):
+                found = slopes(*jax.tree.map(jnp.asarray, crowd), seed=seed, differ=precision == "float64")
+            rows += [{"contact": contact, "precision": precision} | row for row in found]
     files.write_json(folder / "horizon.json", rows)
 
 
+def _on_host(tree: Any) -> Any:
+    """Take arrays off the device, whence `jnp.asarray` rounds them in single precision; keys have none."""
+    return jax.tree.map(lambda a: a if jnp.issubdtype(jnp.result_type(a), jax.dtypes.prng_key) else np.asarray(a), tree)
+
+
+def before(robot: simulation.Params, model: mjx.Model, rooms: simulation.Room) -> dict[int, simulation.State]:
+    """Walk a robot in each room; give the states that are each horizon before the end."""
+    states, found = rollout.start(robot, model, rooms, driver=drivers.LEARNED), {}
+    for left in range(FRAMES, 0, -1):
+        if left in HORIZONS:
+            found[left] = jax.tree.map(jnp.copy, states)  # `advance` uses up what it is given
+        states, _ = rollout.advance(robot, model, rooms, states, driver=drivers.LEARNED, frames=1, draw=True)
+    return found
+
+
 def slopes(
-    robot: simulation.Params, model: mjx.Model, rooms: simulation.Room, seed: int, differ: bool
+    robot: simulation.Params,
+    model: mjx.Model,
+    rooms: simulation.Room,
+    states: Mapping[int, simulation.State],
+    seed: int,
+    differ: bool,
 ) -> list[dict[str, Any]]:
-    """Walk a robot in each room, and take the derivative at every horizon by three routes; a row a horizon and room."""
+    """Take the derivative from the states at every horizon by two or three routes; a row a horizon and room."""
     sizes = jax.tree.map(lambda leaf: jnp.sqrt(jnp.mean(leaf**2)) + 1e-6, robot.controller)
     keys = jax.random.split(jax.random.key(seed), len(jax.tree.leaves(sizes)))
     drawn = [
@@ -71,8 +91,8 @@ def slopes(
     ]
     along = jax.tree.unflatten(jax.tree.structure(robot.controller), drawn)
     rows = []
-    for horizon in HORIZONS:
-        ask = (robot, model, rooms, sizes, jnp.asarray(horizon))
+    for horizon, begun in states.items():
+        ask = (robot, model, rooms, begun, sizes)
         values, gradients = jax.device_get(reverse(*ask))
         columns = {
             "loss": values,
@@ -95,31 +115,36 @@ def slopes(
 
 
 @jax.jit
-def reverse(*ask: Any) -> tuple[Float[Array, " rooms"], controller.Params]:
+def reverse(
+    robot: simulation.Params,
+    model: mjx.Model,
+    rooms: simulation.Room,
+    states: simulation.State,
+    sizes: controller.Params,
+) -> tuple[Float[Array, " rooms"], controller.Params]:
     """Take each room's loss, and its gradient by shares of the parameters' sizes, by reverse mode."""
-    robot, model, rooms, sizes, horizon = ask
 
-    def share(rooms: simulation.Room) -> tuple[Array, controller.Params]:
+    def share(rooms: simulation.Room, states: simulation.State) -> tuple[Array, controller.Params]:
         nothing = imitation.each_its_own(jax.tree.map(jnp.zeros_like, robot.controller), rooms.starts.shape[0])
         (found, _), each = imitation.slopes(
-            lambda shift: (losses(shift, robot, model, rooms, sizes, horizon), None), nothing
+            lambda shift: (losses(shift, robot, model, rooms, states, sizes), None), nothing
         )
         return found, each
 
-    return rollout.deal(share, rooms)
+    return rollout.deal(share, rooms, states)
 
 
 @jax.jit
 def forward(by: Float[Array, ""] | float, along: controller.Params, *ask: Any) -> tuple[Array, Array]:
     """Take each room's loss, the nerves shifted by so much along a direction, and its slope there, by forward mode."""
-    robot, model, rooms, sizes, horizon = ask
+    robot, model, rooms, states, sizes = ask
 
-    def share(rooms: simulation.Room) -> tuple[Array, Array]:
+    def share(rooms: simulation.Room, states: simulation.State) -> tuple[Array, Array]:
         directions = imitation.each_its_own(along, rooms.starts.shape[0])
         shift = jax.tree.map(lambda dx: by * dx, directions)
-        return jax.jvp(lambda shift: losses(shift, robot, model, rooms, sizes, horizon), (shift,), (directions,))
+        return jax.jvp(lambda shift: losses(shift, robot, model, rooms, states, sizes), (shift,), (directions,))
 
-    return rollout.deal(share, rooms)
+    return rollout.deal(share, rooms, states)
 
 
 def losses(
@@ -127,24 +152,23 @@ def losses(
     robot: simulation.Params,
     model: mjx.Model,
     rooms: simulation.Room,
+    states: simulation.State,
     sizes: controller.Params,
-    horizon: Array,
 ) -> Float[Array, " rooms"]:
-    """Sum up the imitation loss of the last frames, each robot's nerves shifted for as long by shares of their size."""
+    """Take the mean imitation loss until `FRAMES`, each robot's nerves shifted by shares of their size.
+
+    All walk `FRAMES` on, of which those beyond do not count: one program serves all horizons.
+    """
 
     @partial(jax.checkpoint, prevent_cse=False)
     def frame(place: tuple[controller.Params, simulation.Room], state: simulation.State, _: None):
-        late = FRAMES - state.frame <= horizon
-        nerves = jax.tree.map(
-            lambda leaf, dx, size: leaf + jnp.where(late, dx, 0.0) * size, robot.controller, place[0], sizes
-        )
+        nerves = jax.tree.map(lambda leaf, dx, size: leaf + dx * size, robot.controller, place[0], sizes)
         own = replace(robot, controller=nerves)
         after, record = simulation.step(own, model, place[1], state, drivers.LEARNED)
-        return after, jnp.where(late, jnp.mean((record.velocity - record.label) ** 2), 0.0)
+        return after, jnp.where(state.frame < FRAMES, jnp.mean((record.velocity - record.label) ** 2), 0.0)
 
-    start = jax.vmap(lambda room: simulation.init(robot, model, room, drivers.LEARNED))(rooms)
-    _, errors = rollout.march(frame, (shift, rooms), start, length=FRAMES)
-    return jnp.sum(errors, axis=1) / horizon
+    _, errors = rollout.march(frame, (shift, rooms), states, length=FRAMES)
+    return jnp.sum(errors, axis=1) / (FRAMES - states.frame)
 
 
 @figures.styled
@@ -162,18 +186,19 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
         sizes = np.array([[row["norm"] for row in double[h]] for h in horizons])
         norm.plot(horizons, np.median(sizes, axis=1), "o-", color=colour, markersize=3, label=contact)
         norm.fill_between(horizons, sizes.min(axis=1), sizes.max(axis=1), color=colour, alpha=0.15)
+        slopes = {name: [_column(double[h], name) for h in horizons] for name in ("slope", "forward", "difference")}
         kinds = {
-            "reverse - forward": ("-", double, "forward"),
-            "reverse - differences": ("--", double, "difference"),
-            "reverse - forward, float32": (":", single, "forward"),
+            "reverse - forward": ("-", slopes["forward"]),
+            "reverse - differences": ("--", slopes["difference"]),
+            "float64 - float32": (":", [_column(single[h], "slope") for h in horizons]),
         }
-        for name, (style, table, other) in kinds.items():
-            apart = [_apart(table[h], other) for h in horizons]
+        for name, (style, others) in kinds.items():
+            apart = list(map(_apart, slopes["slope"], others))
             agreement.plot(horizons, apart, style, color=colour, label=name if contact == "hard" else None)
     norm.set(xscale="log", yscale="log", xlabel="horizon [frames]", ylabel="norm of the gradient")
     norm.legend()
     agreement.set(xscale="log", yscale="log", xlabel="horizon [frames]", ylabel="disagreement of the slope")
-    agreement.legend()
+    agreement.legend(loc="upper left")
     return figure
 
 
@@ -184,7 +209,10 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> dict[int, list[Mapping[str, Any
     return table
 
 
-def _apart(rows: Sequence[Mapping[str, Any]], other: str) -> float:
-    """Take the median over robots of |a - b| / (|a| + |b|), a the slope by reverse mode."""
-    pairs = [(row["slope"], row[other]) for row in rows]
-    return float(np.median([abs(a - b) / max(abs(a) + abs(b), 1e-30) for a, b in pairs])) + 1e-17
+def _column(rows: Sequence[Mapping[str, Any]], name: str) -> Float[np.ndarray, " robots"]:
+    return np.array([row[name] for row in sorted(rows, key=lambda row: row["robot"])])
+
+
+def _apart(a: Float[np.ndarray, " robots"], b: Float[np.ndarray, " robots"]) -> float:
+    """Take the median over robots of |a - b| / (|a| + |b|)."""
+    return float(np.median(np.abs(a - b) / np.maximum(np.abs(a) + np.abs(b), 1e-30))) + 1e-17
