@@ -48,6 +48,7 @@ from mujoco import mjx
 
 from lgmdjax import controller, drivers, lgmd, rollout, simulation
 from lgmdjax.simulation import Params, Record, Room, State, Through
+from lgmdjax.traced import Kept
 
 WIDTH = 0.3  # of a smooth threshold, as a share of it
 
@@ -104,7 +105,7 @@ def loss(
     return found[0], jax.tree.map(lambda leaf: leaf[0], rest)
 
 
-@partial(jax.jit, static_argnames="settings", donate_argnames="states")
+@partial(Kept, donated=("states",))
 def gradient(
     params: Params, model: mjx.Model, rooms: Room, states: State, sizes: controller.Params, *, settings: Settings
 ) -> tuple[Gradient, State, Record]:
