@@ -290,8 +290,9 @@ def test_evolution_estimates_the_slope_that_reverse_mode_takes():
     def loss(params, goal):
         return jnp.sum((params["a"] - goal) ** 2) + 3 * params["b"] ** 2, 2 * goal
 
-    value, exact, ends = stride.METHODS["gradient"](loss, 1)(start, goals, jax.random.key(0))
-    tried, estimate, same = stride.METHODS["evolution"](loss, 20000)(start, goals, jax.random.key(0))
+    settings = replace(scales.GRADIENTS["stride"], pairs=20000)
+    value, exact, ends = stride.METHODS["gradient"](loss, settings)(start, goals, jax.random.key(0))
+    tried, estimate, same = stride.METHODS["evolution"](loss, settings)(start, goals, jax.random.key(0))
     np.testing.assert_allclose(exact["a"], 2 * (start["a"] - 1))
     np.testing.assert_allclose(ends, 2 * goals)
     np.testing.assert_allclose(same, 2 * goals)

@@ -7,8 +7,8 @@ and the loss of a window of theirs (`lgmdjax.strides`) is
     L = mean over robots of ((s - s*) / 5 mm/s)^2 + ((w - w*) / 0.05 rad/s)^2 + 0.5 (a / a_0)^2 + 0.1 (e / e_0)^2,
 
 of which Adam follows the gradient, through every contact of the window. Robots walk on from window to window. Beside
-it, an evolution strategy follows differences of the same loss, with the same optimiser, from the same start, for as
-many simulated steps.
+it, an evolution strategy follows differences of the same loss, with the same optimiser at a rate of its own, from the
+same start, for as many simulated steps.
 
 | symbol   | name   | unit  | meaning                                                                          |
 | -------- | ------ | ----- | -------------------------------------------------------------------------------- |
@@ -51,7 +51,6 @@ ROBOTS = 2  # of each command
 SPEED = float(gait.Gait().nominal_velocity)  # m/s
 OFF_SPEED, OFF_TURN = 0.005, 0.05  # m/s, rad/s; errors that count as much as all of the sway does
 SWAY_COUNTS, EFFORT_COUNTS = 0.5, 0.1
-SIGMA = 0.02  # by how much the evolution strategy tries, as a share of each weight's size
 
 
 @struct.dataclass(kw_only=True)
@@ -116,12 +115,12 @@ def follower(legs: Legs, model: mjx.Model, settings: scales.Stride, method: str)
         sound = hexapod.is_sound(end.data)
         return jnp.where(sound, cost(course, task.velocity, task.first), jnp.nan), end
 
-    slope = METHODS[method](loss, settings.pairs)
-    each = robots * settings.window * (1 if method == "gradient" else 2 * settings.pairs)
+    slope = METHODS[method](loss, settings)
+    walks, rate = (1, settings.learning_rate) if method == "gradient" else (2 * settings.pairs, settings.evolution_rate)
+    each = robots * settings.window * walks
     steps = round(settings.robot_seconds / each)
     optimiser = optax.chain(
-        optax.clip_by_global_norm(settings.clip),
-        optax.adam(optax.cosine_decay_schedule(settings.learning_rate, steps)),
+        optax.clip_by_global_norm(settings.clip), optax.adam(optax.cosine_decay_schedule(rate, steps))
     )
 
     @jax.jit
@@ -172,7 +171,7 @@ def going_on(tasks: Task, ends: Walker, began: Task) -> Task:
     return replace(tasks, walker=jax.vmap(one)(ends, began.walker))
 
 
-def _reverse(loss: Callable, _: int) -> Callable:
+def _reverse(loss: Callable, _: scales.Stride) -> Callable:
     """Take the slope by reverse mode, through the body; those that fell or have no finite slope do not count."""
 
     def slope(scaled: Any, tasks: Any, key: Array):
@@ -188,8 +187,10 @@ def _reverse(loss: Callable, _: int) -> Callable:
     return slope
 
 
-def _evolution(loss: Callable, pairs: int) -> Callable:
+def _evolution(loss: Callable, settings: scales.Stride) -> Callable:
     """Estimate the slope from the losses at random places to both sides (an evolution strategy, antithetic)."""
+
+    pairs, sigma = settings.pairs, settings.sigma
 
     def slope(scaled: Any, tasks: Any, key: Array):
         draw = partial(optax.tree.random_like, target_tree=scaled, sampler=jax.random.normal)
@@ -199,12 +200,12 @@ def _evolution(loss: Callable, pairs: int) -> Callable:
             return loss(jax.tree.map(lambda x, e: x + by * e, scaled, noise), task)
 
         def tried(task: Any, noise: Any):
-            (up, end), (down, _) = (shifted(task, noise, by) for by in (SIGMA, -SIGMA))
+            (up, end), (down, _) = (shifted(task, noise, by) for by in (sigma, -sigma))
             return up, down, end
 
         up, down, ends = rollout.deal(jax.vmap(lambda task: jax.vmap(partial(tried, task))(noise)), tasks)
         sound = jnp.isfinite(up - down)
-        weights = jnp.mean((up - down) / (2 * SIGMA), axis=0, where=sound)
+        weights = jnp.mean((up - down) / (2 * sigma), axis=0, where=sound)
         slopes = jax.tree.map(lambda leaf: jnp.tensordot(weights, leaf, axes=1) / pairs, noise)
         return jnp.mean((up + down) / 2, where=sound), slopes, jax.tree.map(lambda leaf: leaf[:, 0], ends)
 
