@@ -43,7 +43,7 @@ PACKAGE = Path(__file__).parent
 class Kept:
     """A function under `jax.jit`, whose positional arguments are arrays and whose keywords are static.
 
-    Where JAX has no cache, or within another traced function, it is traced like any other.
+    Where JAX has no cache on disk, or within another traced function, it is traced like any other.
 
     Args:
         function: pure, and of this package.
@@ -55,7 +55,7 @@ class Kept:
         names = list(inspect.signature(function).parameters)
         self._function, self._name = function, function.__name__
         self._donated = tuple(names.index(name) for name in donated)
-        self._programs: dict[str, Any] = {}
+        self._programs: dict[tuple[str, Path | None], Any] = {}
 
     def __call__(self, *arguments: Any, **static: Any) -> Any:
         """Call the function."""
@@ -67,16 +67,22 @@ class Kept:
 
     def program(self, *arguments: Any, **static: Any) -> Any:
         """Find the program of such arguments, in memory or on disk, or else trace it: a `jax.jit` of them alone."""
-        cache = _setting(CACHE)
-        inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
         digest = _digest(self._function, jax.tree.map(lambda leaf: str(jax.typeof(leaf)), arguments), static)
-        place = digest if cache is None or inside else str(Path(cache, "traced", f"{self._name}-{digest}.pickle"))
-        if place not in self._programs:
+        inside = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
+        folder = None if inside else _folder()
+        if (digest, folder) not in self._programs:
             function = functools.partial(self._function, **static)
-            if place != digest:
-                function = _read(Path(place)) or _trace(function, arguments, Path(place))
-            self._programs[place] = jax.jit(function, donate_argnums=self._donated)
-        return self._programs[place]
+            if folder is not None:
+                place = folder / f"{self._name}-{digest}.pickle"
+                function = _read(place) or _trace(function, arguments, place)
+            self._programs[digest, folder] = jax.jit(function, donate_argnums=self._donated)
+        return self._programs[digest, folder]
+
+
+def _folder() -> Path | None:
+    """Give the place for traced programs in JAX's cache; None if there is none, or it is in a store elsewhere."""
+    cache = _setting(CACHE)
+    return None if cache is None or "://" in cache else Path(cache, "traced")
 
 
 def _digest(function: Callable[..., Any], types: Any, static: dict[str, Any]) -> str:

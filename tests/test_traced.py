@@ -144,13 +144,15 @@ def test_a_cache_that_cannot_be_written_is_none(cache, counted):
         assert_solved(make()(*arguments()))
 
 
-def test_without_a_cache_it_is_a_jitted_function(cache, counted):
+@pytest.mark.parametrize("other", [None, "gs://bucket/cache"])
+def test_without_a_cache_on_disk_it_is_a_jitted_function(cache, counted, tmp_path, monkeypatch, other):
     make, calls = counted
-    jax.config.update(traced.CACHE, None)
+    monkeypatch.chdir(tmp_path)
+    jax.config.update(traced.CACHE, other)
     kept = make()
     for _ in range(2):
         assert_solved(kept(*arguments()))
-    assert len(calls) == 1 and not cache.exists()
+    assert len(calls) == 1 and not list(tmp_path.iterdir())
 
 
 def test_within_another_function_it_is_traced_along(cache, counted):
