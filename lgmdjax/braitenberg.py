@@ -34,6 +34,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
+from lgmdjax.extremes import larger, within
 from lgmdjax.shaping import FASTEST, SLOWEST
 
 Scalar = Float[Array, ""] | float
@@ -107,7 +108,7 @@ def limit(params: Params, velocity: Float[Array, "2"]) -> Float[Array, "2"]:
     obstacle 0.3 m away on the left, this makes (2, -1), of (2.2, 0.8) it makes (2, 0.6).
     """
     most = params.fastest - params.slowest
-    return _drive(params, jnp.mean(velocity), jnp.clip(velocity[1] - velocity[0], -most, most))
+    return _drive(params, jnp.mean(velocity), within(velocity[1] - velocity[0], -most, most))
 
 
 def init(params: Params) -> State:
@@ -125,10 +126,10 @@ def step(params: Params, state: State, distances: Float[Array, "2"]) -> tuple[St
     nearness = _nearness(distances)
     velocity = respond(params, nearness)
     turn = velocity[1] - velocity[0]
-    danger = jnp.clip((params.near - jnp.min(distances)) / (params.near - params.close), 0.0, 1.0)
+    danger = within((params.near - jnp.min(distances)) / (params.near - params.close), 0.0, 1.0)
     tied = jnp.abs(nearness[1] - nearness[0]) < params.symmetry * jnp.sum(nearness)
     side = _side(params, state.side, turn, near=danger > 0, tied=tied)
-    strength = jnp.maximum(side * turn, danger * params.full_turn)
+    strength = larger(side * turn, danger * params.full_turn)
     mean = jnp.mean(velocity)
     limited = limit(params, mean + side * strength * jnp.asarray([-0.5, 0.5], velocity.dtype))
     return watch(params, limited), limited
@@ -163,13 +164,13 @@ def check(params: Params) -> None:
 
 
 def _nearness(distances: Float[Array, "2"]) -> Float[Array, "2"]:
-    return 1 / jnp.maximum(distances, SHORTEST)
+    return 1 / larger(distances, SHORTEST)
 
 
 def _drive(params: Params, mean: Float[Array, ""], turn: Float[Array, ""]) -> Float[Array, "2"]:
     """Make the velocity of a turn (v_right - v_left), its mean as near to the asked one as can be."""
     half = jnp.abs(turn) / 2
-    mean = jnp.clip(mean, params.slowest + half, params.fastest - half)
+    mean = within(mean, params.slowest + half, params.fastest - half)
     return jnp.stack([mean - turn / 2, mean + turn / 2])
 
 

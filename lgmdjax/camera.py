@@ -35,7 +35,7 @@ from lgmdjax.texture import WAVES
 Leaf = Array | np.ndarray
 
 _TILE = (math.radians(4.3), math.radians(8.6))
-"""About how high and wide a tile is: small ones hold few prisms, wide ones are long loops."""
+"""About how high and wide a tile is: small ones hold few prisms, large ones are long loops."""
 _COARSE = 25.0
 """Pictures of fewer pixels a radian have tiles of 2 x 4 pixels at least, others of 4 x 8, which are twice as fast."""
 
@@ -115,7 +115,7 @@ def crowding(
 
 
 class _Field(NamedTuple):
-    """The pixels of an eye in its own frame, (3, rows, height, columns, width) by tiles, and cones about them.
+    """The pixels of an eye in its own frame, (3, tiles, pixels), and cones about them.
 
     A tile is wider than high and has several cones, (tiles, cones) side by side: one about all of it would be high.
     """
@@ -148,24 +148,34 @@ def _grid(params: Params) -> _Grid:
 
 def _field(params: Params, first: int) -> tuple[np.ndarray, ...]:
     """Lay out the rays from column `first` on, a few beyond the picture where tiles do not fit into it."""
-    n = params.samples
-    f = n * params.width / params.fov
-    (_, height, columns) = shape(params)
-    least = 2 if f < _COARSE else 4
-    high, wide = tile(height * n, _TILE[0] * f, least), tile(columns * n, _TILE[1] * f, 2 * least)
-    rows, across = -(-height * n // high), -(-columns * n // wide)
+    n, f = params.samples, _focal_length(params)
+    rows, across, high, wide = _tiles(params)
     v, u = np.mgrid[: rows * high, : across * wide] + 0.5
     pixels = equidistant(u + n * first - 0.5 * n * params.width, v - 0.5 * n * params.height, f)
-    d, d_u, d_v = (a.reshape(3, rows, high, across, wide) for a in pixels)
+    d, d_u, d_v = (np.swapaxes(a.reshape(3, rows, high, across, wide), 2, 3) for a in pixels)
     size = min(high, wide)
     parts = d[..., np.linspace(0, wide - size, -(-wide // size)).astype(int)[:, None] + np.arange(size)]
-    axes = parts.sum(axis=(2, 5))
+    axes = parts.sum(axis=(3, 5))
     axes /= np.linalg.norm(axes, axis=0)
-    cosines = np.einsum("arhcpw,arcp->rhcpw", parts, axes).min(axis=(1, 4))
+    cosines = np.einsum("archpw,arcp->rchpw", parts, axes).min(axis=(2, 4))
     # A pixel reaches farther than its ray, by half a diagonal.
     radii = np.arccos(np.clip(cosines, -1.0, 1.0)) + 0.75 / f
     tiles = rows * across
+    d, d_u, d_v = (a.reshape(3, tiles, -1) for a in (d, d_u, d_v))
     return d, d_u, d_v, np.moveaxis(axes, 0, -1).reshape(tiles, -1, 3), radii.reshape(tiles, -1)
+
+
+def _focal_length(params: Params) -> float:
+    """Give f in rays a radian."""
+    return params.samples * params.width / params.fov
+
+
+def _tiles(params: Params) -> tuple[int, int, int, int]:
+    """Count the rows and columns of tiles, and the rows and columns of rays in each."""
+    (_, height, columns), n, f = shape(params), params.samples, _focal_length(params)
+    least = 2 if f < _COARSE else 4
+    high, wide = tile(height * n, _TILE[0] * f, least), tile(columns * n, _TILE[1] * f, 2 * least)
+    return -(-height * n // high), -(-columns * n // wide), high, wide
 
 
 def tile(length: int, wanted: float, least: int) -> int:
@@ -195,10 +205,9 @@ def _look(arena: Arena, position: Array, rotation: Array, field: _Field) -> tupl
 
 
 def _eye(params: Params, arena: Arena, position: Array, rotation: Array, field: _Field) -> Array:
-    """Draw one eye: (rows, height, columns, width) by tiles, which are its pixels in their order."""
-    _, rows, _, columns, _ = field.d.shape
+    """Draw one eye: (tiles, pixels), each tile's pixels in a row, for which XLA's loops read its prisms once."""
     picked = silhouettes.pick(*_look(arena, position, rotation, field), params.slots)
-    picked = jax.tree.map(lambda a: a.reshape(rows, 1, columns, 1), picked)
+    picked = jax.tree.map(lambda a: a[:, None], picked)
 
     def turned(rays: Array) -> tuple[Array, Array, Array]:
         x, y, z = (rotation[i, 0] * rays[0] + rotation[i, 1] * rays[1] + rotation[i, 2] * rays[2] for i in range(3))
@@ -210,8 +219,8 @@ def _eye(params: Params, arena: Arena, position: Array, rotation: Array, field: 
 
 def _assemble(params: Params, grey: Array) -> Array:
     """Join the tiles, cut off what is beyond the picture, and average the samples of a pixel."""
-    eyes, height, columns = shape(params)
-    n = params.samples
-    _, rows, high, across, wide = grey.shape
-    picture = grey.reshape(eyes, rows * high, across * wide)[:, : height * n, : columns * n]
+    (eyes, height, columns), n = shape(params), params.samples
+    rows, across, high, wide = _tiles(params)
+    lines = jnp.swapaxes(grey.reshape(eyes, rows, across, high, wide), 2, 3)
+    picture = lines.reshape(eyes, rows * high, across * wide)[:, : height * n, : columns * n]
     return picture if n == 1 else jnp.mean(picture.reshape(eyes, height, n, columns, n), axis=(2, 4))

@@ -13,9 +13,11 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from lgmdjax.extremes import larger, smaller, within
 from lgmdjax.silhouettes import Pair
 from lgmdjax.texture import Vector
 
@@ -65,8 +67,8 @@ def slopes(s: Pair, pixels: Rays) -> Vector:
 def _slant(m_u: Array, m_v: Array) -> Slant:
     """Take p, q and k of an edge from the slopes of its margin."""
     m_u, m_v = jnp.abs(m_u), jnp.abs(m_v)
-    p = jnp.maximum(m_u, m_v) + 1e-9
-    q = jnp.maximum(jnp.minimum(m_u, m_v), 1e-3 * p)
+    p = larger(m_u, m_v) + 1e-9
+    q = larger(smaller(m_u, m_v), 1e-3 * p)
     both = once(1.0 / (p * q))  # one division for all
     return Slant(p, q * both, 0.5 * q * q * both, p * p * both)
 
@@ -76,15 +78,15 @@ def part(margin: Array, slant: Slant) -> Array:
 
     The other part, or where it is the larger this one, is a corner: a triangle of height x, cut at k.
     """
-    x = jnp.maximum(0.5 + slant.half - jnp.abs(margin), 0.0)
-    cut = jnp.minimum(x, 2.0 * slant.half)
+    x = larger(0.5 + slant.half - jnp.abs(margin), 0.0)
+    cut = smaller(x, 2.0 * slant.half)
     corner = slant.inverse * (x - 0.5 * cut) * cut
     return jnp.where(margin > 0, 1.0 - corner, corner)
 
 
 def ramp(margin: Array) -> Array:
     """`part` at half its price, for an edge whose margin is in units of its smear."""
-    return jnp.clip(0.5 + margin, 0.0, 1.0)
+    return within(0.5 + margin, 0.0, 1.0)
 
 
 def part_and_way(margin: Vector) -> tuple[Array, Pair]:
@@ -104,7 +106,7 @@ def rise(z: Array, slopes: Vector, pixels: Rays) -> tuple[Array, Pair]:
     m, m_u, m_v = _below(z, slopes, pixels)
     across, along = jnp.abs(m_u), jnp.abs(m_v)
     # Aslant an edge is smeared farther; of straight ramps this one is the nearest.
-    inverse = once(1.0 / (jnp.maximum(across, along) + 0.2 * jnp.minimum(across, along) + 1e-9))
+    inverse = once(1.0 / (larger(across, along) + 0.2 * smaller(across, along) + 1e-9))
     return m * inverse, (m_u * inverse, m_v * inverse)
 
 
@@ -114,7 +116,11 @@ def _below(z: Array, slopes: Vector, pixels: Rays) -> Vector:
     return m, m_u, m_v
 
 
+@jax.custom_jvp
 def once(quotient: Array) -> Array:
     """Give a division a single user, a bound that is never reached: XLA would not fuse it into several, nor anything
     before it, and write them all to memory."""
     return jnp.minimum(quotient, 1e30)
+
+
+once.defjvps(lambda change, _, quotient: change)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from lgmdjax import raycast
 from lgmdjax.arena import Arena
 from lgmdjax.errors import InputError
+from lgmdjax.extremes import smaller
 
 
 @struct.dataclass(kw_only=True)
@@ -54,7 +55,7 @@ def scan(
     phi = bearings(params).astype(rotation.dtype)
     # Written out, because a float32 matrix product on a GPU may round to ten bits.
     directions = jnp.cos(phi)[:, None] * rotation[:, 0] + jnp.sin(phi)[:, None] * rotation[:, 1]
-    return jnp.minimum(raycast.distance(arena, position, directions), params.clip)
+    return smaller(raycast.distance(arena, position, directions), params.clip)
 
 
 def hemifields(ranges: Float[Array, "*batch rays"]) -> Float[Array, "*batch 2"]:

@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 from lgmdjax import edges, texture
 from lgmdjax.arena import Arena
+from lgmdjax.extremes import larger
 from lgmdjax.silhouettes import NEAR, Pair, Silhouette
 from lgmdjax.texture import Texture, Vector
 
@@ -55,6 +56,8 @@ class Layer(NamedTuple):
 @functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
 def draw(arena: Arena, eye: Array, pixels: edges.Rays, prisms: list[Silhouette], bands: int) -> Array:
     """Blend the two nearest layers of every pixel over the mean grey of the third and of what is behind that.
+
+    Arrays of pixels are (tiles, pixels), those of prisms (tiles, 1).
 
     Gradient: that of the same drawing with its loops as `lax.scan`, and with what many loops read written down.
     Unrolled they are one expression, the fastest to evaluate, but its derivative would take minutes to compile. The
@@ -173,7 +176,7 @@ def _prism(prism: Silhouette, pixels: edges.Rays, keep: Keep) -> Layer:
     shift_u, shift_v = (
         by_lid_end * lid_shift[i] + by_other_end * other_shift[i] + by_side * pixels.rightward[i] for i in (0, 1)
     )
-    cover = jnp.maximum(left + right - 1.0, 0.0) * jnp.maximum(to_lid + to_other - 1.0, 0.0)
+    cover = larger(left + right - 1.0, 0.0) * larger(to_lid + to_other - 1.0, 0.0)
     on_lid = prism.lid * d[2]
     by_lid = on_lid < side[0] + jnp.where(lidless, -_OPEN, jnp.where(within, _OPEN, 0.0))
     s = (jnp.where(by_lid, 0.0, near[0]), jnp.where(by_lid, 0.0, near[1]), jnp.where(by_lid, prism.lid, 0.0))
@@ -219,7 +222,7 @@ def _round_sides(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[P
     p_x, p_y = o_x * power, o_y * power
     moment = o_x * y - o_y * x
     q_square = prism.radius_square * (x * x + y * y) - moment * moment
-    inverse = lax.rsqrt(jnp.maximum(q_square, 0.2 * prism.limb * width + 1e-12))
+    inverse = lax.rsqrt(larger(q_square, 0.2 * prism.limb * width + 1e-12))
     b = o_x * x + o_y * y
     e_x, e_y = (b * p_x - x) * inverse, (b * p_y - y) * inverse
     return (p_x + e_x, p_y + e_y), (p_x - e_x, p_y - e_y)
@@ -247,7 +250,7 @@ def _room(arena: Arena, eye: Array, pixels: edges.Rays, keep: Keep) -> _Room:
     floor, floor_shift = edges.part_below(-eye[2], slopes, pixels)
     below_top, top_shift = edges.part_below(arena.wall_height - eye[2], slopes, pixels)
     sky = 1.0 - below_top
-    wall = jnp.maximum(1.0 - floor - sky, 0.0)
+    wall = larger(1.0 - floor - sky, 0.0)
 
     rows = texture.prepare(arena.wall_texture)
     x_row, y_row = (choose(pixels.d[i] > 0, _row(rows, 2 * i + 1), _row(rows, 2 * i)) for i in (0, 1))
@@ -268,9 +271,9 @@ def _room(arena: Arena, eye: Array, pixels: edges.Rays, keep: Keep) -> _Room:
         return Layer(nearness, cover, (shift_u, shift_v), s, (-eye[0], -eye[1]), row)
 
     zero = jnp.zeros_like(part)
-    as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / jnp.maximum(eye[2], NEAR)), floor_row)
+    as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / larger(eye[2], NEAR)), floor_row)
     as_wall = layer(jnp.where(floor_first, 1.0, jnp.where(on_edge, wall, wall * part)), (*wall_s, zero), wall_row)
-    as_other = layer(wall * (1.0 - part) / jnp.maximum(1.0 - wall * part, 1e-3), (*other_s, zero), other_row)
+    as_other = layer(wall * (1.0 - part) / larger(1.0 - wall * part, 1e-3), (*other_s, zero), other_row)
     mean = floor * floor_row.brightness + wall * wall_row.brightness + sky * arena.sky
     beside = jnp.where(on_edge, floor_row.brightness, jnp.where(sky > 0, arena.sky, other_row.brightness))
     return _Room(
@@ -285,7 +288,7 @@ def _room(arena: Arena, eye: Array, pixels: edges.Rays, keep: Keep) -> _Room:
 def _walls(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
     """Tell whether a wall in x is met before one in y, and s of both."""
     low, high = eye[:2] - arena.room[0::2], arena.room[1::2] - eye[:2]
-    forth, back = 1.0 / jnp.maximum(high, NEAR), -1.0 / jnp.maximum(low, NEAR)
+    forth, back = 1.0 / larger(high, NEAR), -1.0 / larger(low, NEAR)
     s_x, s_y = jnp.where(d[0] > 0, forth[0], back[0]), jnp.where(d[1] > 0, forth[1], back[1])
     zero = jnp.zeros_like(s_x)
     return s_x * d[0] > s_y * d[1], (s_x, zero), (zero, s_y)
@@ -299,7 +302,7 @@ def _part_of_nearer(wall: Pair, other: Pair, pixels: edges.Rays) -> tuple[Array,
 def _shade(handedness: Array, eye: Array, pixels: edges.Rays, layer: Layer, bands: int) -> Array:
     """Grey of a layer where the rays meet it, averaged over the pixel."""
     d, s = pixels.d, layer.s
-    t = edges.once(1.0 / jnp.maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
+    t = edges.once(1.0 / larger(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
     scaled = t * layer.texture.frequency
 
     def step(change: Vector) -> Vector:
