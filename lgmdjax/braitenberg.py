@@ -34,7 +34,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
-from lgmdjax.extremes import larger, within
+from lgmdjax.extremes import larger, smaller, within
 from lgmdjax.shaping import FASTEST, SLOWEST
 
 Scalar = Float[Array, ""] | float
@@ -126,7 +126,7 @@ def step(params: Params, state: State, distances: Float[Array, "2"]) -> tuple[St
     nearness = _nearness(distances)
     velocity = respond(params, nearness)
     turn = velocity[1] - velocity[0]
-    danger = within((params.near - jnp.min(distances)) / (params.near - params.close), 0.0, 1.0)
+    danger = within((params.near - smaller(distances[0], distances[1])) / (params.near - params.close), 0.0, 1.0)
     tied = jnp.abs(nearness[1] - nearness[0]) < params.symmetry * jnp.sum(nearness)
     side = _side(params, state.side, turn, near=danger > 0, tied=tied)
     strength = larger(side * turn, danger * params.full_turn)

@@ -1,8 +1,11 @@
 """The larger and the smaller of two, with a derivative that none loses.
 
 JAX differentiates `jnp.maximum` by asking which of the two is equal to it. XLA may compute them anew to ask, and come
-to another last bit: then neither is, and the slope is lost, here and there and in silence. These ask which is larger.
+to another last bit: then neither is, and the slope is lost, here and there and in silence (so it was at the limbs of
+cylinders, in `test_gradients_are_those_of_central_differences_in_both_modes`). These ask which is larger.
 """
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,32 +13,60 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 
-@jax.custom_jvp
 def larger(a: ArrayLike, b: ArrayLike) -> Array:
     """max(a, b). Gradient: that of the larger one; of b where they are equal."""
-    return jnp.maximum(a, b)
+    return _larger(*_alike(a, b))
 
 
-@jax.custom_jvp
 def smaller(a: ArrayLike, b: ArrayLike) -> Array:
     """min(a, b). Gradient: that of the smaller one; of b where they are equal."""
-    return jnp.minimum(a, b)
+    return _smaller(*_alike(a, b))
 
 
-@larger.defjvp
-def _larger_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    (a, b), (da, db) = primals, tangents
-    found = larger(a, b)
-    return found, jnp.where(a > b, da, db).astype(found.dtype)
-
-
-@smaller.defjvp
-def _smaller_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    (a, b), (da, db) = primals, tangents
-    found = smaller(a, b)
-    return found, jnp.where(a < b, da, db).astype(found.dtype)
+def least(a: ArrayLike, axis: int) -> Array:
+    """Take the least along an axis. Gradient: that of the first of the least, where `jnp.min` may come to 0/0."""
+    return _least(axis, jnp.asarray(a))
 
 
 def within(x: Array, low: ArrayLike, high: ArrayLike) -> Array:
     """Limit x to low .. high. Gradient: 1 between them, else 0."""
     return smaller(larger(x, low), high)
+
+
+def _alike(a: ArrayLike, b: ArrayLike) -> list[Array]:
+    """Give both the dtype of the result: whole numbers have no tangents."""
+    return [jnp.asarray(x, jnp.result_type(a, b)) for x in (a, b)]
+
+
+@jax.custom_jvp
+def _larger(a: Array, b: Array) -> Array:
+    return jnp.maximum(a, b)
+
+
+@_larger.defjvp
+def _larger_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (a, b), slopes = primals, tangents
+    return _larger(a, b), jnp.where(a > b, *slopes)
+
+
+@jax.custom_jvp
+def _smaller(a: Array, b: Array) -> Array:
+    return jnp.minimum(a, b)
+
+
+@_smaller.defjvp
+def _smaller_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (a, b), slopes = primals, tangents
+    return _smaller(a, b), jnp.where(a < b, *slopes)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _least(axis: int, a: Array) -> Array:
+    return jnp.min(a, axis)
+
+
+@_least.defjvp
+def _least_jvp(axis: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (a,), (slope,) = primals, tangents
+    where = jnp.argmin(a, axis, keepdims=True)
+    return _least(axis, a), jnp.take_along_axis(slope, where, axis).squeeze(axis)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from lgmdjax import raycast
 from lgmdjax.arena import Arena
 from lgmdjax.errors import InputError
-from lgmdjax.extremes import smaller
+from lgmdjax.extremes import least, smaller
 
 
 @struct.dataclass(kw_only=True)
@@ -62,4 +62,4 @@ def hemifields(ranges: Float[Array, "*batch rays"]) -> Float[Array, "*batch 2"]:
     """Find d_l and d_r [m], the nearest on either side (for eq. 22); the middle ray belongs to both."""
     middle = ranges.shape[-1] // 2
     right = ranges[..., : ranges.shape[-1] - middle]
-    return jnp.stack([jnp.min(ranges[..., middle:], axis=-1), jnp.min(right, axis=-1)], axis=-1)
+    return jnp.stack([least(ranges[..., middle:], axis=-1), least(right, axis=-1)], axis=-1)

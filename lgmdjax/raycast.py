@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lgmdjax.arena import Arena
-from lgmdjax.extremes import larger, smaller
+from lgmdjax.extremes import larger, least, smaller
 from lgmdjax.prisms import Prisms, turned
 
 _TINY = 1.0e-7
@@ -34,8 +34,8 @@ def distance(arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "
     """
     d = jnp.moveaxis(directions, -1, 0)
     room = smaller(to_floor(origin, directions), to_walls(arena, origin, directions))
-    boxes = jnp.min(_to_boxes(arena.boxes, origin, d), axis=0)
-    cylinders = jnp.min(_to_cylinders(arena.cylinders, origin, d), axis=0)
+    boxes = least(_to_boxes(arena.boxes, origin, d), axis=0)
+    cylinders = least(_to_cylinders(arena.cylinders, origin, d), axis=0)
     return smaller(room, smaller(boxes, cylinders))
 
 

@@ -6,14 +6,15 @@ also keeps what comes of that (`jax.export`, 1 to 2 MB), where JAX keeps its com
 seconds.
 
 A program is taken for the same if function and static arguments are, and structure, shapes and precision of the others;
-if all files of this package are, byte by byte; and JAX, MJX, devices and JAX's settings. What is replaced in a module
-that runs (monkeypatching) is not noticed: do without a cache then.
+if all files of this package are, byte by byte, since it was imported; and JAX, MJX, devices and JAX's settings. What is
+replaced in a module that runs (monkeypatching) is not noticed: do without a cache then.
 
 | file in the cache's folder         | what                                                    |
 | ---------------------------------- | ------------------------------------------------------- |
 | traced/<function>-<digest>.pickle  | program as StableHLO in bytes, structure of its results |
 
-As those of JAX's own cache, these files are code: a cache is nothing to take from strangers.
+As those of JAX's own cache, these files are code: a cache is nothing to take from strangers. Nothing deletes those of
+older versions of the package.
 """
 
 import functools
@@ -34,19 +35,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 from jax.core import Tracer
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array
 
 CACHE = "jax_compilation_cache_dir"
-SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion")  # that change what is traced
-PACKAGE = Path(__file__).parent
 
 
 class Kept:
-    """A function under `jax.jit`, whose positional arguments are arrays and whose keywords are static.
+    """A function as under `jax.jit`: positional arguments are trees of arrays, keywords are static.
 
-    Where JAX has no cache on disk, or within another traced function, it is traced like any other.
+    Where JAX has no cache on disk, or within another traced function, it is traced like any other. Else it is a program
+    for the default backend.
 
     Args:
-        function: pure, and of this package.
+        function: pure, of this package, and no closure.
         donated: names of arguments that are used up.
     """
 
@@ -81,7 +83,7 @@ class Kept:
 
 def _folder() -> Path | None:
     """Give the place for traced programs in JAX's cache; None if there is none, or it is in a store elsewhere."""
-    cache = _setting(CACHE)
+    cache = getattr(jax.config, CACHE)
     return None if cache is None or "://" in cache else Path(cache, "traced")
 
 
@@ -89,26 +91,27 @@ def _digest(function: Callable[..., Any], types: Any, static: dict[str, Any]) ->
     """Sum up all that a program hangs on."""
     name = function.__module__, function.__qualname__
     versions = [version(name) for name in ("jax", "jaxlib", "mujoco-mjx")]
-    settings = [str(_setting(name)) for name in SETTINGS]
+    # All that could change what is traced, and much that does not: to trace anew in vain is the lesser harm.
+    names = [name for name in sorted(jax.config.values) if "cache" not in name]
+    settings = [str(getattr(jax.config, name, jax.config.values[name])) for name in names]
     devices = [jax.default_backend(), jax.local_device_count()]
-    everything = name, types, sorted(static.items()), versions, settings, devices, _package()
+    everything = name, types, sorted(static.items()), versions, settings, devices, SOURCES
     # In words: of equal things pickle makes other bytes where parts of them are one object.
     with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
         return hashlib.sha256(repr(everything).encode()).hexdigest()[:32]
 
 
-def _setting(name: str) -> Any:
-    return getattr(jax.config, name)
-
-
-@functools.cache
-def _package() -> str:
-    """Sum up the files of this package."""
-    files = [path for path in sorted(PACKAGE.rglob("*")) if path.is_file() and "__pycache__" not in path.parts]
+def _sum(folder: Path) -> str:
+    """Sum up the files of a package."""
     whole = hashlib.sha256()
-    for path in files:
-        whole.update(f"{path.relative_to(PACKAGE)}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            whole.update(f"{path.relative_to(folder)}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
     return whole.hexdigest()
+
+
+SOURCES = _sum(Path(__file__).parent)
+"""Of this package, when it was imported: what is edited later is not what runs."""
 
 
 def _trace(function: Callable[..., Any], arguments: tuple[Any, ...], place: Path) -> Callable[..., Any]:
@@ -156,7 +159,14 @@ def _called(exported: export.Exported, results: Any) -> Callable[..., Any]:
     # JAX looks up where SciPy has LAPACK when it lowers a call of it; else a program that was read crashes (jax#29610).
     jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
 
+    # JAX refuses to call a program for several devices where no argument is on them.
+    everywhere = Mesh(np.asarray(jax.local_devices()[: exported.nr_devices]), ("device",))
+
+    def placed(leaf: Any) -> Array:
+        anyhow = PartitionSpec(*[PartitionSpec.UNCONSTRAINED] * jnp.ndim(leaf))
+        return jax.lax.with_sharding_constraint(leaf, NamedSharding(everywhere, anyhow))
+
     def call(*arguments: Any) -> Any:
-        return jax.tree.unflatten(results, exported.call(*jax.tree.leaves(arguments)))
+        return jax.tree.unflatten(results, exported.call(*map(placed, jax.tree.leaves(arguments))))
 
     return call

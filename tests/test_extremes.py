@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lgmdjax.extremes import larger, smaller, within
+from lgmdjax.extremes import larger, least, smaller, within
 
 A, B = np.array([[1.0, -2.0, 0.5]]), np.array([[0.0], [0.7]])
 
@@ -22,9 +22,20 @@ def test_has_the_value_and_the_slope_of_the_one_that_is_taken(ours, numpys, sign
     np.testing.assert_array_equal(slope, np.where(taken, 2, 3))
 
 
-def test_against_a_number_of_python():
-    slope = jax.vmap(jax.grad(lambda x: larger(x, 0.0)))(jnp.asarray([-1.0, 0.0, 2.0]))
+@pytest.mark.parametrize("zero", [0, 0.0, np.zeros((), int)])
+def test_against_a_number(zero):
+    slope = jax.vmap(jax.grad(lambda x: larger(x, zero)))(jnp.asarray([-1.0, 0.0, 2.0]))
     np.testing.assert_array_equal(slope, [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("axis", [0, -1])
+def test_the_least_has_the_slope_of_the_first_of_them(axis):
+    a = np.array([[3.0, 1.0, 2.0], [0.5, 1.0, 0.5]])
+    np.testing.assert_array_equal(least(a, axis), a.min(axis))
+    slope = jax.grad(lambda a: jnp.sum(least(a, axis)))(jnp.asarray(a))
+    expected = np.zeros_like(a)
+    np.put_along_axis(expected, np.expand_dims(a.argmin(axis), axis), 1.0, axis)
+    np.testing.assert_array_equal(slope, expected)
 
 
 def test_limits_and_is_level_beyond_them():

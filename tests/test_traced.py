@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from flax import struct
 
-from lgmdjax import traced
+from lgmdjax import rollout, traced
 
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """A cache of this test alone: where files of traced programs are, and nothing else of JAX."""
-    before = traced._setting(traced.CACHE)
+    before = getattr(jax.config, traced.CACHE)
     jax.config.update(traced.CACHE, str(tmp_path))
     yield tmp_path / "traced"
     jax.config.update(traced.CACHE, before)
@@ -92,9 +92,11 @@ def test_is_traced_anew_for_other_arguments_settings_and_sources(cache, counted,
     kept(*arguments(jnp.float32))
     with jax.default_matmul_precision("highest"):
         kept(*arguments())
-    monkeypatch.setattr(traced, "_package", lambda: "edited")
+    with jax.threefry_partitionable(False):
+        kept(*arguments())
+    monkeypatch.setattr(traced, "SOURCES", "edited")
     kept(*arguments())
-    assert len(calls) == len(list(cache.iterdir())) == 5
+    assert len(calls) == len(list(cache.iterdir())) == 6
 
 
 def test_functions_of_one_name_are_two(cache):
@@ -113,13 +115,12 @@ def test_functions_of_one_name_are_two(cache):
     assert [float(traced.Kept(make())(jnp.ones(()))) for make in (more, less)] == [2.0, 0.0]
 
 
-def test_the_package_is_known_by_every_byte(tmp_path, monkeypatch):
-    monkeypatch.setattr(traced, "PACKAGE", tmp_path)
+def test_the_package_is_known_by_every_byte(tmp_path):
     (tmp_path / "__pycache__").mkdir()
     sums = []
     for name, content in (("a.py", "1"), ("a.py", "2"), ("b.py", "2"), ("__pycache__/a.pyc", "3")):
         (tmp_path / name).write_text(content)
-        sums.append(traced._package.__wrapped__())
+        sums.append(traced._sum(tmp_path))
     assert len(set(sums)) == 3 and sums[2] == sums[3]
 
 
@@ -171,6 +172,28 @@ def test_what_is_used_up_is_gone_and_the_rest_is_not(cache, counted):
         places, used = arguments()
         kept(places, used)
         assert used.is_deleted() and not places["A"].is_deleted()
+
+
+def test_crowds_are_dealt_out_wherever_their_arrays_are(cache):
+    """Also by a program for two devices, whose arguments are on one of them, or on the host, or where it left them."""
+    assert jax.local_device_count() == 2
+    traces = []
+
+    def stir(keys, x):
+        traces.append(x.shape)
+        return rollout.deal(lambda keys, x: (keys, x + jax.vmap(jax.random.uniform)(keys)), keys, x)
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    drawn = np.asarray(jax.vmap(jax.random.uniform)(keys))
+    for _ in range(2):
+        kept = traced.Kept(stir, donated=("x",))
+        for x in (np.zeros(4), jnp.zeros(4)):
+            for turn in range(1, 4):
+                keys, x = kept(keys, x)
+                np.testing.assert_allclose(x, turn * drawn, rtol=1e-12)
+            assert len(x.sharding.device_set) == 2
+        kept.lower(keys, np.zeros(4)).compile()
+    assert len(traces) == 1
 
 
 def test_its_program_can_be_lowered(cache, counted):

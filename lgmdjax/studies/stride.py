@@ -189,7 +189,6 @@ def _reverse(loss: Callable, _: scales.Stride) -> Callable:
 
 def _evolution(loss: Callable, settings: scales.Stride) -> Callable:
     """Estimate the slope from the losses at random places to both sides (an evolution strategy, antithetic)."""
-
     pairs, sigma = settings.pairs, settings.sigma
 
     def slope(scaled: Any, tasks: Any, key: Array):
