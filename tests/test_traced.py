@@ -191,7 +191,7 @@ def test_crowds_are_dealt_out_wherever_their_arrays_are(cache):
             for turn in range(1, 4):
                 keys, x = kept(keys, x)
                 np.testing.assert_allclose(x, turn * drawn, rtol=1e-12)
-            assert len(x.sharding.device_set) == 2
+            assert len(keys.sharding.device_set) == 2
         kept.lower(keys, np.zeros(4)).compile()
     assert len(traces) == 1
 
