@@ -5,6 +5,7 @@ to another last bit: then neither is, and the slope is lost, here and there and 
 cylinders, in `test_gradients_are_those_of_central_differences_in_both_modes`). These ask which is larger.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -38,26 +39,18 @@ def _alike(a: ArrayLike, b: ArrayLike) -> list[Array]:
     return [jnp.asarray(x, jnp.result_type(a, b)) for x in (a, b)]
 
 
-@jax.custom_jvp
-def _larger(a: Array, b: Array) -> Array:
-    return jnp.maximum(a, b)
+def _chosen(value: Callable[[Array, Array], Array], is_first: Callable[[Array, Array], Array]) -> Callable[..., Array]:
+    """Give one of two, and the slope of the first where it is that."""
+
+    @jax.custom_jvp
+    def one(a: Array, b: Array) -> Array:
+        return value(a, b)
+
+    one.defjvp(lambda both, slopes: (one(*both), jnp.where(is_first(*both), *slopes)))
+    return one
 
 
-@_larger.defjvp
-def _larger_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    (a, b), slopes = primals, tangents
-    return _larger(a, b), jnp.where(a > b, *slopes)
-
-
-@jax.custom_jvp
-def _smaller(a: Array, b: Array) -> Array:
-    return jnp.minimum(a, b)
-
-
-@_smaller.defjvp
-def _smaller_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    (a, b), slopes = primals, tangents
-    return _smaller(a, b), jnp.where(a < b, *slopes)
+_larger, _smaller = _chosen(jnp.maximum, jnp.greater), _chosen(jnp.minimum, jnp.less)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
