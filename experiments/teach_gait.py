@@ -1,14 +1,12 @@
 """Teach the shaping networks that come with the package: `python experiments/teach_gait.py` (a minute on two cores)."""
 
-from pathlib import Path
-
 import jax
 from tqdm import tqdm
 
 from lgmdjax import hexapod, legs, lesson, shaping
+from lgmdjax.paths import SHAPING
 
 STEPS, SEED = 6000, 1
-TAUGHT = Path(shaping.__file__).parent / "data" / "shaping.safetensors"
 
 
 def main() -> None:
@@ -20,7 +18,7 @@ def main() -> None:
             bar.update(done - bar.n)
 
         networks = lesson.teach(legs.geometry(hexapod.load()), key=jax.random.key(SEED), steps=STEPS, progress=show)
-    shaping.save(TAUGHT, networks, {"steps": STEPS, "seed": SEED})
+    shaping.save(SHAPING, networks, {"steps": STEPS, "seed": SEED})
 
 
 if __name__ == "__main__":

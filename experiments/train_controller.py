@@ -13,6 +13,7 @@ import tyro
 
 from lgmdjax import scales
 from lgmdjax.cli import guarded, import_physics, prepare_jax
+from lgmdjax.paths import PRETRAINED
 
 FILES = {"fit-gait": ("shaping.safetensors",), "train": ("controller.safetensors", "baselines.npz")}
 
@@ -27,12 +28,12 @@ def main(out: Path = Path("runs"), seed: int = 2026) -> None:
     prepare_jax()  # before anything imports JAX
     import_physics()
     from lgmdjax.runs import execute, open_run
-    from lgmdjax.stages import STAGES, crew
+    from lgmdjax.stages import STAGES
 
     train = execute(open_run(out, f"paper-{seed}", "paper", seed, scales.SCALES["paper"]), STAGES, "train")
     for stage, names in FILES.items():
         for name in names:
-            shutil.copyfile(train.parent / stage / name, crew.DATA / name)
+            shutil.copyfile(train.parent / stage / name, PRETRAINED / name)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ World and trunk frames: x forward, y left, z up. The sources of the numbers stan
 """
 
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +28,7 @@ from mujoco import mjx
 
 from lgmdjax import arena, implicit
 from lgmdjax.errors import InputError
+from lgmdjax.paths import MJCF
 
 LEGS = ("left_front", "left_middle", "left_rear", "right_rear", "right_middle", "right_front")
 JOINTS = ("coxa", "femur", "tibia")
@@ -60,11 +60,10 @@ class _Anatomy(NamedTuple):
 
 def xml_path() -> Path:
     """Find the robot's XML: inside the installed package, else beside it in the checkout."""
-    places = [Path(str(files("lgmdjax"))) / "mjcf", Path(__file__).resolve().parent.parent / "mjcf"]
-    for place in places:
+    for place in MJCF:
         if (place / "hexapod.xml").is_file():
             return place / "hexapod.xml"
-    raise InputError(f"expected hexapod.xml in {' or '.join(map(str, places))}, found none: reinstall lgmdjax")
+    raise InputError(f"expected hexapod.xml in {' or '.join(map(str, MJCF))}, found none: reinstall lgmdjax")
 
 
 def load(path: Path | str | None = None) -> mujoco.MjModel:

@@ -31,6 +31,7 @@ from lgmdjax import arena, camera, collisions, figures, film, hexapod, scenes, t
 from lgmdjax.errors import InputError
 from lgmdjax.files import read_arrays, read_json
 from lgmdjax.gait import Gait
+from lgmdjax.paths import PACKAGE
 from lgmdjax.studies import failures, printed, sensitivity, teaching, velocity
 
 MINUS = "\N{MINUS SIGN}"
@@ -249,7 +250,7 @@ def _size() -> dict[str, float]:
 
 def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("lgmdjax"),
+        loader=jinja2.FileSystemLoader(PACKAGE / "templates"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -18,7 +18,6 @@ Source: Cizek & Faigl, sec. 3.2. The networks are taught by `lgmdjax.lesson.teac
 import json
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 
 import jax
@@ -30,6 +29,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialise
 
 from lgmdjax.errors import InputError
+from lgmdjax.paths import SHAPING
 
 LEGS, INPUTS, UNITS, JOINTS = 6, 3, 6, 3
 SLOWEST, FASTEST = -1.0, 2.0  # the range of velocities that the networks are taught, and so what the legs can do
@@ -144,4 +144,4 @@ def metadata(path: Path | str) -> dict[str, object]:
 
 def taught() -> Params:
     """Load the networks that come with the package, as `experiments/teach_gait.py` made them."""
-    return load(Path(str(files("lgmdjax") / "data" / "shaping.safetensors")))
+    return load(SHAPING)

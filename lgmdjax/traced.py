@@ -38,6 +38,8 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
+from lgmdjax.paths import PACKAGE
+
 CACHE = "jax_compilation_cache_dir"
 
 
@@ -110,7 +112,7 @@ def _sum(folder: Path) -> str:
     return whole.hexdigest()
 
 
-SOURCES = _sum(Path(__file__).parent)
+SOURCES = _sum(PACKAGE)
 """Of this package, when it was imported: what is edited later is not what runs."""
 
 

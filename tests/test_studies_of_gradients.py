@@ -11,10 +11,11 @@ import pytest
 from safetensors import safe_open
 
 from lgmdjax import hexapod, scales, shaping, simulation, strides, treadmill
+from lgmdjax.paths import PRETRAINED
 from lgmdjax.stages import crew
 from lgmdjax.studies import horizon, stride
 
-INPUTS = {"fit-gait": crew.DATA, "train": crew.DATA}
+INPUTS = {"fit-gait": PRETRAINED, "train": PRETRAINED}
 SETTINGS = scales.Stride(
     robot_seconds=2880.0, window=1.6, learning_rate=5e-3, clip=1.0, pairs=2, sigma=0.02, evolution_rate=5e-3, seeds=2
 )

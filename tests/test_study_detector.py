@@ -15,6 +15,7 @@ from reference import lgmd as reference
 
 from lgmdjax import apprentice, episodes, figures, lgmd, navigator, scales, sight, training
 from lgmdjax.errors import InputError
+from lgmdjax.paths import PRETRAINED
 from lgmdjax.stages import crew
 from lgmdjax.studies import detector
 
@@ -170,7 +171,7 @@ def test_other_pictures_than_those_seen_are_refused():
 
 
 def test_without_a_run_there_is_nothing_to_fit_to(tmp_path):
-    inputs: dict[str, Path] = {"fit-gait": crew.DATA, "train": crew.DATA}
+    inputs: dict[str, Path] = {"fit-gait": PRETRAINED, "train": PRETRAINED}
     with pytest.raises(InputError, match="expected a run"):
         detector.work(tmp_path, inputs, SETTINGS, 0)
 

@@ -28,8 +28,7 @@ from lgmdjax import (
 )
 from lgmdjax.errors import InputError
 from lgmdjax.files import read_arrays
-
-DATA = Path(__file__).parent.parent / "data" / "trained"  # gait and controller of one run: each learned with the other
+from lgmdjax.paths import PRETRAINED
 
 
 def eyes(settings: scales.Eyes) -> camera.Params:
@@ -44,7 +43,7 @@ def robot(gait: Path, settings: scales.Eyes, detector: lgmd.Params, crew: driver
     return with_eyes(params, settings)
 
 
-def trained(gait: Path = DATA, train: Path = DATA) -> simulation.Params:
+def trained(gait: Path = PRETRAINED, train: Path = PRETRAINED) -> simulation.Params:
     """Put a robot together from two folders, all five drivers aboard, with the eyes that its navigator learned from.
 
     Args:

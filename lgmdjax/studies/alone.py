@@ -11,6 +11,7 @@ import tyro
 
 from lgmdjax import attempt, figures, files, scales
 from lgmdjax.cli import AttemptFlags, Who
+from lgmdjax.paths import PRETRAINED
 from lgmdjax.runs import Stage, execute, open_run
 from lgmdjax.stages import crew
 
@@ -79,5 +80,5 @@ def told(outcome: Mapping[str, Any]) -> str:
 
 def _inputs(run: Path | None) -> dict[str, Path]:
     if run is None:
-        return {"fit-gait": crew.DATA, "train": crew.DATA}
+        return {"fit-gait": PRETRAINED, "train": PRETRAINED}
     return {name: run / name for name in ("fit-gait", "collect", "train")}
