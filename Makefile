@@ -43,5 +43,5 @@ clean:
 
 # For maintainers, with uv on the path: the newest versions that pyproject.toml allows, for every supported Python.
 lock:
-	uv pip compile pyproject.toml --extra dev --extra notebooks --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra dev --extra docs --extra notebooks --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command 'make lock' --output-file requirements.lock

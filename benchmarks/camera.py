@@ -23,7 +23,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from lgmdjax import arena, camera
+from lgmdjax.sensors import camera
+from lgmdjax.world import arena
 
 ROUNDS = 30
 EYES = camera.Params()

@@ -20,33 +20,29 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from lgmdjax import (
-    braitenberg,
-    camera,
-    drivers,
-    hexapod,
-    rollout,
-    simulation,
-)
+from lgmdjax.body import hexapod
+from lgmdjax.control import braitenberg, policies
+from lgmdjax.sensors import camera
+from lgmdjax.simulation import closed_loop, rollout, room_batches, sharding
 
 RESOLUTIONS = ((320, 240, 60.0), (160, 120, 240.0))  # pixels, and the robot-frames a second asked for
 FRAMES = 10  # of a measured chunk
 REPEATS = 5
 
 
-def robot(width: int, height: int) -> simulation.Params:
+def robot(width: int, height: int) -> closed_loop.Params:
     """Put a robot together that its teacher drives and whose eyes draw the whole picture."""
-    return simulation.assemble(braitenberg.Params(), eyes=camera.Params(width=width, height=height))
+    return closed_loop.assemble(braitenberg.Params(), eyes=camera.Params(width=width, height=height))
 
 
-def measure(params: simulation.Params, robots: int) -> tuple[float, float]:
+def measure(params: closed_loop.Params, robots: int) -> tuple[float, float]:
     """Return robot-frames a second (median) and megabytes of temporaries a robot."""
-    model, rooms = hexapod.build(), rollout.random_rooms(jax.random.key(0), robots, 0.25)
-    states = rollout.start(params, model, rooms, driver=drivers.TEACHER)
-    fixed = {"driver": drivers.TEACHER, "frames": FRAMES}
+    model, rooms = hexapod.build(), room_batches.random_rooms(jax.random.key(0), robots, 0.25)
+    states = rollout.start(params, model, rooms, driver=policies.TEACHER)
+    fixed = {"driver": policies.TEACHER, "frames": FRAMES}
     compiled = rollout.advance.lower(params, model, rooms, states, draw=jnp.asarray(True), **fixed).compile()
     analysis = compiled.memory_analysis()
-    share = robots / rollout.shares(robots)
+    share = robots / sharding.shares(robots)
     memory = analysis.temp_size_in_bytes / 1e6 / share if analysis else math.nan  # not every device tells
     seconds = []
     for _ in range(REPEATS + 1):  # the first is thrown away
@@ -69,7 +65,7 @@ def by_hand(width: int, height: int) -> float:
     seconds = []
     for _ in range(REPEATS):
         began = time.perf_counter()
-        for _ in range(simulation.SUBSTEPS):
+        for _ in range(closed_loop.SUBSTEPS):
             mujoco.mj_step(model, data)
         for site in hexapod.EYES:
             mujoco.mj_multiRay(

@@ -34,11 +34,14 @@ import jax.numpy as jnp
 import tyro
 from mujoco import mjx
 
-from lgmdjax import controller, drivers, hexapod, imitation, rollout, scales, simulation, tuning
-from lgmdjax.stages import crew
+from lgmdjax.body import hexapod
+from lgmdjax.control import controller, policies
+from lgmdjax.learning import finetuning, rollout_gradient
+from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches, sharding
 
 Kind = Literal["walk", "remat", "kept", "forward mode"]
-EYES = scales.Eyes(width=80, height=60, pooling=3)
+EYES = CameraSettings(width=80, height=60, pooling=3)
 ASKED = 5.0  # walks that a gradient with remat may cost
 ASKED_COLD, ASKED_WARM = 180.0, 15.0  # s of its compilation
 REPEATS = 3
@@ -71,7 +74,7 @@ def measure(case: Case, cache: str) -> Cost:
     jax.config.update("jax_compilation_cache_dir", cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     robot, model, rooms, states, sizes = crowd(case.robots)
-    settings = imitation.Settings(frames=case.frames, draw=case.draw, remat=case.kind != "kept")
+    settings = rollout_gradient.Settings(frames=case.frames, draw=case.draw, remat=case.kind != "kept")
     began = time.perf_counter()
     lowered = program(case.kind).lower(robot, model, rooms, states, sizes, settings=settings)
     traced = time.perf_counter()
@@ -79,7 +82,7 @@ def measure(case: Case, cache: str) -> Cost:
     ready = time.perf_counter()
     analysis, work = compiled.memory_analysis(), case.robots * case.frames
     # Not every device tells; what it tells is its own share.
-    memory = analysis.temp_size_in_bytes * rollout.shares(case.robots) if analysis else math.nan
+    memory = analysis.temp_size_in_bytes * sharding.shares(case.robots) if analysis else math.nan
     fits = not memory > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2
     seconds = timed(lambda states: compiled(robot, model, rooms, states, sizes), states) if fits else math.nan
     leaves = zip(*map(jax.tree.leaves, (robot.controller, sizes)), strict=True)
@@ -92,15 +95,17 @@ def measure(case: Case, cache: str) -> Cost:
     )
 
 
-def crowd(robots: int) -> tuple[simulation.Params, mjx.Model, simulation.Room, simulation.State, controller.Params]:
+def crowd(robots: int) -> tuple[closed_loop.Params, mjx.Model, closed_loop.Room, closed_loop.State, controller.Params]:
     """Put robots into rooms; give what `imitation.gradient` takes, everything that can be tuned being tuned."""
-    robot = imitation.smooth(imitation.alone(crew.with_eyes(crew.trained(), EYES)))
-    model, rooms = hexapod.build(), rollout.random_rooms(jax.random.key(0), robots)
-    states = rollout.start(robot, model, rooms, driver=drivers.LEARNED)
-    return robot, model, rooms, states, tuning.sizes(robot.controller, tuple(vars(robot.controller)))
+    robot = rollout_gradient.smooth(rollout_gradient.alone(assembly.with_eyes(assembly.trained(), EYES)))
+    model, rooms = hexapod.build(), room_batches.random_rooms(jax.random.key(0), robots)
+    states = rollout.start(robot, model, rooms, driver=policies.LEARNED)
+    return robot, model, rooms, states, finetuning.sizes(robot.controller, tuple(vars(robot.controller)))
 
 
-def timed(advance: Callable[[simulation.State], tuple[Any, simulation.State, Any]], states: simulation.State) -> float:
+def timed(
+    advance: Callable[[closed_loop.State], tuple[Any, closed_loop.State, Any]], states: closed_loop.State
+) -> float:
     """Take the median seconds of a window, walking on from each to the next; the first is thrown away."""
     seconds = []
     for _ in range(REPEATS + 1):
@@ -113,36 +118,38 @@ def timed(advance: Callable[[simulation.State], tuple[Any, simulation.State, Any
 def program(kind: Kind) -> Any:
     """Choose what is compiled: all take and give what `imitation.gradient` does."""
     if kind in ("remat", "kept"):
-        return imitation.gradient
+        return rollout_gradient.gradient
 
     @partial(jax.jit, static_argnames="settings", donate_argnames="states")
     def window(
-        params: simulation.Params,
+        params: closed_loop.Params,
         model: mjx.Model,
-        rooms: simulation.Room,
-        states: simulation.State,
+        rooms: closed_loop.Room,
+        states: closed_loop.State,
         sizes: controller.Params,
         *,
-        settings: imitation.Settings,
+        settings: rollout_gradient.Settings,
     ) -> Any:
-        def share(rooms: simulation.Room, states: simulation.State) -> Any:
+        def share(rooms: closed_loop.Room, states: closed_loop.State) -> Any:
             robots = rooms.starts.shape[0]
 
             def losses(nerves: controller.Params) -> Any:
-                return imitation.losses(nerves, params, model, rooms, states, settings)
+                return rollout_gradient.losses(nerves, params, model, rooms, states, settings)
 
-            def frame(room: simulation.Room, state: simulation.State, _: None) -> Any:
-                return simulation.step(params, model, room, state, drivers.LEARNED, settings.draw)
+            def frame(room: closed_loop.Room, state: closed_loop.State, _: None) -> Any:
+                return closed_loop.step(params, model, room, state, policies.LEARNED, settings.draw)
 
             if kind == "walk":  # by the same nerves for all
                 after, record = rollout.march(frame, rooms, states, length=settings.frames)
                 return jnp.mean((record.velocity - record.label) ** 2, axis=(1, 2)), (after, record)
-            nerves = imitation.each_its_own(params.controller, robots)
+            nerves = rollout_gradient.each_its_own(params.controller, robots)
             along = jax.tree.map(lambda size, leaf: jnp.broadcast_to(size, jnp.shape(leaf)), sizes, params.controller)
-            value, slope, rest = jax.jvp(losses, (nerves,), (imitation.each_its_own(along, robots),), has_aux=True)
+            value, slope, rest = jax.jvp(
+                losses, (nerves,), (rollout_gradient.each_its_own(along, robots),), has_aux=True
+            )
             return (value, slope), rest
 
-        found, (states, record) = rollout.deal(share, rooms, states)
+        found, (states, record) = sharding.deal(share, rooms, states)
         return found, states, record
 
     return window

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgmdjax import lgmd
+from lgmdjax.detectors import lgmd
 
 SIZES = ((80, 60), (160, 120), (320, 240), (640, 480))
 FRAMES = 16

@@ -22,9 +22,10 @@ import optax
 import tyro
 from flax import nnx
 
-from lgmdjax import navigator, tapes, training
-from lgmdjax.episodes import FIELDS, Walk
-from lgmdjax.simulation import FRAME_RATE
+from lgmdjax.control import navigator
+from lgmdjax.learning import behaviour_cloning, sequences
+from lgmdjax.simulation.closed_loop import FRAME_RATE
+from lgmdjax.simulation.episodes import FIELDS, Walk
 
 MINUTES, STRETCHES = 15, 30
 ASKED = 120.0  # s for 1000 epochs
@@ -43,11 +44,11 @@ def invented(seed: int) -> Walk:
 
 def ours(walks: list[Walk], epochs: int) -> float:
     """Seconds of a fit, compilation and checkpoints included."""
-    first, second = tapes.halve(walks)
+    first, second = sequences.halve(walks)
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         start = navigator.create(jax.random.key(0))
-        training.fit(start, first, second, training.Settings(epochs=epochs), checkpoints=folder)
+        behaviour_cloning.fit(start, first, second, behaviour_cloning.Settings(epochs=epochs), checkpoints=folder)
         return time.perf_counter() - began
 
 
@@ -69,8 +70,8 @@ def looped(walks: list[Walk], epochs: int) -> float:
         optimiser.update(network, slope)
         return error
 
-    settings = training.Settings()
-    first, _ = tapes.halve(walks)
+    settings = behaviour_cloning.Settings()
+    first, _ = sequences.halve(walks)
     u, label = (_windows(np.concatenate([getattr(walk, name) for walk in first]), settings) for name in ("u", "label"))
     network = Network(nnx.Rngs(0))
     optimiser = nnx.Optimizer(network, optax.rmsprop(1e-3, decay=0.9, eps=1e-7), wrt=nnx.Param)
@@ -84,7 +85,7 @@ def looped(walks: list[Walk], epochs: int) -> float:
     return epochs * float(np.median(seconds[1:]))
 
 
-def _windows(values: np.ndarray, settings: training.Settings) -> jax.Array:
+def _windows(values: np.ndarray, settings: behaviour_cloning.Settings) -> jax.Array:
     """Cut (frames, 2) into (windows, frames, streams, 2), mirrored streams beside the others."""
     size = settings.window * settings.streams
     kept = values[: len(values) // size * size].reshape(settings.streams, -1, settings.window, 2)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import tyro
 
-from lgmdjax.cli import guarded
+from lgmdjax.cli.main import guarded
 from lgmdjax.errors import InputError
-from lgmdjax.files import read_json, write_json
+from lgmdjax.runtime.storage import read_json, write_json
 
 WALKS = ("*.parquet", "walk.npz", "trajectories.npz", "walks", "episodes")
 DRAWN = ("*.svg", "*.png", "*.npz")

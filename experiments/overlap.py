@@ -7,7 +7,8 @@ import sys
 
 import tyro
 
-from lgmdjax.cli import guarded, import_physics, prepare_jax
+from lgmdjax.cli.main import guarded
+from lgmdjax.runtime.jax_setup import import_physics, prepare_jax
 
 if __name__ == "__main__":
     prepare_jax()

@@ -5,11 +5,12 @@
 
 import sys
 
-from lgmdjax.cli import guarded, import_physics, prepare_jax
+from lgmdjax.cli.main import guarded
+from lgmdjax.runtime.jax_setup import import_physics, prepare_jax
 
 if __name__ == "__main__":
     prepare_jax()
     import_physics()
-    from lgmdjax.studies import alone
+    from lgmdjax.cli import study
 
-    sys.exit(guarded(lambda: alone.compare("indoor", "outdoor", "dynamic")))
+    sys.exit(guarded(lambda: study.compare("indoor", "outdoor", "dynamic")))

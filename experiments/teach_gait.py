@@ -3,7 +3,8 @@
 import jax
 from tqdm import tqdm
 
-from lgmdjax import hexapod, legs, lesson, shaping
+from lgmdjax.body import hexapod
+from lgmdjax.locomotion import gait_fit, kinematics, shaping
 from lgmdjax.paths import SHAPING
 
 STEPS, SEED = 6000, 1
@@ -17,7 +18,9 @@ def main() -> None:
             bar.set_postfix_str(f"{loss**0.5:.2f} mm", refresh=False)
             bar.update(done - bar.n)
 
-        networks = lesson.teach(legs.geometry(hexapod.load()), key=jax.random.key(SEED), steps=STEPS, progress=show)
+        networks = gait_fit.teach(
+            kinematics.geometry(hexapod.load()), key=jax.random.key(SEED), steps=STEPS, progress=show
+        )
     shaping.save(SHAPING, networks, {"steps": STEPS, "seed": SEED})
 
 

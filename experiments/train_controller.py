@@ -11,9 +11,10 @@ from pathlib import Path
 
 import tyro
 
-from lgmdjax import scales
-from lgmdjax.cli import guarded, import_physics, prepare_jax
+from lgmdjax.cli.main import guarded
 from lgmdjax.paths import PRETRAINED
+from lgmdjax.pipeline import scales
+from lgmdjax.runtime.jax_setup import import_physics, prepare_jax
 
 FILES = {"fit-gait": ("shaping.safetensors",), "train": ("controller.safetensors", "baselines.npz")}
 
@@ -27,8 +28,8 @@ def main(out: Path = Path("runs"), seed: int = 2026) -> None:
     """
     prepare_jax()  # before anything imports JAX
     import_physics()
-    from lgmdjax.runs import execute, open_run
-    from lgmdjax.stages import STAGES
+    from lgmdjax.pipeline.stages import STAGES
+    from lgmdjax.runtime.run_folders import execute, open_run
 
     train = execute(open_run(out, f"paper-{seed}", "paper", seed, scales.SCALES["paper"]), STAGES, "train")
     for stage, names in FILES.items():

@@ -5,7 +5,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from lgmdjax import arena, rollout, scenes, simulation
+from lgmdjax.simulation import closed_loop, room_batches
+from lgmdjax.world import arena, scenes
 
 
 def beside(key: jax.Array, lateral: float) -> arena.Arena:
@@ -30,11 +31,11 @@ def in_the_testing_room(key: jax.Array) -> arena.Arena:
     return replace(scenes.testing_room(key), start=jax.numpy.array([0.1, 1.4, -0.5 * np.pi]))
 
 
-def with_mirror_images(built: list[arena.Arena]) -> simulation.Room:
+def with_mirror_images(built: list[arena.Arena]) -> closed_loop.Room:
     """Make rooms of scenes, each followed by its mirror image, in which robots start over and over in one place."""
-    return rollout.stack(
+    return room_batches.stack(
         [
-            simulation.Room(arena=room, starts=jax.numpy.tile(room.start, (4, 1)), key=jax.random.key(0))
+            closed_loop.Room(arena=room, starts=jax.numpy.tile(room.start, (4, 1)), key=jax.random.key(0))
             for one in built
             for room in (one, arena.mirror(one))
         ]

@@ -9,7 +9,12 @@ from typing import Any
 from beartype import BeartypeConf, FrozenDict, beartype
 from numpy.typing import ArrayLike
 
-STREAMS = ("lgmdjax.cli", "lgmdjax.film", "lgmdjax.video", "lgmdjax.watch")  # looking into a stream uses it up
+STREAMS = (
+    "lgmdjax.cli.main",
+    "lgmdjax.reporting.walk_video",
+    "lgmdjax.reporting.video_io",
+    "lgmdjax.cli.watch",
+)  # looking into a stream uses it up
 CONSTRUCTORS = ("__init__", "check_single_arg", "check_params")  # JAX makes pytrees of placeholders through them
 
 # NumPy takes nested tuples too, but its own annotation says no to them at run time.

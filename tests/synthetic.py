@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lgmdjax import arena, scores
-from lgmdjax.collisions import KINDS
-from lgmdjax.simulation import FRAME_RATE, Record
+from lgmdjax.evaluation import metrics
+from lgmdjax.evaluation.collision_causes import KINDS
+from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
+from lgmdjax.world import arena
 
 DRIVERS = ("teacher", "learned", "blind", "direct", "random")
 RATES = {"teacher": 0.4, "learned": 3.21, "blind": 17.3, "direct": 12.9, "random": 19.8}
@@ -90,27 +91,27 @@ def score(rate: float) -> dict:
 
 def rows_of(study: str) -> list[dict]:
     """Rows of a study as it writes them."""
-    rate = {"per_100_m": asdict(scores.poisson_rate(2, 0.9)), "distance": 90.0, "collisions": 2}
+    rate = {"per_100_m": asdict(metrics.poisson_rate(2, 0.9)), "distance": 90.0, "collisions": 2}
     if study == "velocity":
         row = {"obstructed": 0.6, "free": 0.55, "spread": 0.02}
         return [
             row | {"velocity": v, "effect": v, "as_good": v > 1, "low": v - 0.1, "high": v + 0.1, "speed": 0.05 * v}
             for v in (0.1, 1.0, 5.0)
         ]
-    if study == "teaching":
+    if study == "supervision":
         pupils = [{"driver": "learned", "rule": "2a", "variant": "lstm", "start": start} | rate for start in range(3)]
         return [{"driver": "teacher", "rule": "2a"} | rate, {"driver": "direct", "rule": "teacher"} | rate, *pupils]
-    if study == "printed":
-        stuck = {"per_100_m": asdict(scores.poisson_rate(0, 0.001)), "distance": 0.1, "collisions": 0}
+    if study == "errata":
+        stuck = {"per_100_m": asdict(metrics.poisson_rate(0, 0.001)), "distance": 0.1, "collisions": 0}
         row = {"case": "eq. 15", "speed": 0.05, "u": {"score": 0.7, "left": 0.5, "right": 0.6}}
         return [row | {"teacher": rate, "learned": rate}, row | {"case": "eq. 1", "teacher": stuck, "learned": stuck}]
-    if study == "failures":
-        away = {"avoided": asdict(scores.wilson(9, 12)), "untouched": 9, "robots": 12, "passed": 6, "retreated": 2}
+    if study == "failure_modes":
+        away = {"avoided": asdict(metrics.wilson(9, 12)), "untouched": 9, "robots": 12, "passed": 6, "retreated": 2}
         walls = [{"place": "white", "contrast": c, "driver": "learned"} | away for c in (0.0, 0.5)]
         others = [{"place": "white", "contrast": 0.0, "driver": "teacher"} | away]
         corners = [{"place": "corner", "contrast": None, "driver": name} | away for name in ("learned", "eq. 22")]
         return walls + others + corners
-    if study == "stride":
+    if study == "gait_gradient":
         walked = {
             "velocities": [1.0, 2.0],
             "speed_errors": [1e-3, 2e-3],
@@ -121,7 +122,7 @@ def rows_of(study: str) -> list[dict]:
             {"method": m, "start": 0, "curve": [[28.8, 0.6], [57.6, 0.4]]} | walked for m in ("gradient", "evolution")
         ]
         return [{"method": "before", "start": 0, "curve": []} | walked, *fits]
-    if study == "horizon":
+    if study == "gradient_horizon":
         return [
             {"contact": contact, "precision": precision, "robot": robot, "horizon": horizon, "norm": 0.1 * horizon}
             | {"slope": 1.0, "forward": 1.0 + 1e-12, "difference": 1.0 + 1e-8}
@@ -139,7 +140,7 @@ def write_experiments(run: Path) -> Path:
     """Add to a run folder what `--scale paper` has beside: a trial that ends, and the studies."""
     facts = json.loads((run / "run.json").read_text())
     facts["settings"]["evaluate"]["places"].append({"trial": "tube", "eyes": {"width": 320, "height": 240}})
-    for study in ("velocity", "teaching", "printed", "failures", "sensitivity"):
+    for study in ("velocity", "supervision", "errata", "failure_modes", "sensitivity"):
         facts["settings"][study] = {"bench": {"robots": 16, "eyes": {"width": 80, "height": 60}}}
         (run / study).mkdir()
         (run / study / "done.json").write_bytes((run / "train" / "done.json").read_bytes())
@@ -154,7 +155,7 @@ def write_experiments(run: Path) -> Path:
         "clearance": [0.1] * 30,
         "seconds": [20.0] * 30,
     }
-    outcome["avoided"] = asdict(scores.wilson(29, 30))
+    outcome["avoided"] = asdict(metrics.wilson(29, 30))
     evaluation["tube"] = dict.fromkeys(("teacher", "learned", "blind"), outcome)
     _json(run / "evaluate" / "evaluation.json", evaluation)
     (run / "evaluate" / "tube.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")

@@ -11,9 +11,12 @@ import numpy as np
 import places
 import pytest
 
-from lgmdjax import drivers, hexapod, rollout, scales, scenes
-from lgmdjax.stages import crew
+from lgmdjax.body import hexapod
+from lgmdjax.control import policies
+from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.simulation import assembly, recording, rollout
 from lgmdjax.studies import velocity
+from lgmdjax.world import scenes
 
 SECONDS = 30.0
 
@@ -60,11 +63,13 @@ def rooms():
 def walks(rooms):
     """Walk them, eyes open; axes (scene, as it is or mirrored, frame)."""
     with jax.enable_x64(False):
-        robot = crew.with_eyes(crew.trained(), scales.Eyes(width=80, height=60, pooling=3))
+        robot = assembly.with_eyes(assembly.trained(), CameraSettings(width=80, height=60, pooling=3))
         model = hexapod.build()
         records = {}
-        for driver in (drivers.LEARNED, drivers.BLIND):
-            record = rollout.together(list(crew.walks(crew.seat(robot, driver), model, rooms, SECONDS, driver.name)))
+        for driver in (policies.LEARNED, policies.BLIND):
+            record = rollout.together(
+                list(recording.walks(assembly.seat(robot, driver), model, rooms, SECONDS, driver.name))
+            )
             records[driver.name] = jax.tree.map(lambda x: x.reshape(len(SCENES), 2, *x.shape[1:]), record)
     return records
 

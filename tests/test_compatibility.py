@@ -15,8 +15,12 @@ import pytest
 from safetensors.numpy import load_file
 
 import lgmdjax
-from lgmdjax import episodes, navigator, paths, shaping, traced, training
-from lgmdjax.stages import collect, crew
+from lgmdjax import paths
+from lgmdjax.control import navigator
+from lgmdjax.learning import behaviour_cloning
+from lgmdjax.locomotion import shaping
+from lgmdjax.runtime import export_cache
+from lgmdjax.simulation import assembly, episodes
 
 OLD = Path(__file__).parent / "data" / "v0.1.0"
 RUN = OLD / "smoke-0"
@@ -34,17 +38,17 @@ def test_kept_programs_are_known_by_every_file_of_the_package(tmp_path):
     """A change of any one file, in whatever folder, must make another sum than the one that is looked for."""
     copy = tmp_path / "lgmdjax"
     shutil.copytree(paths.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    assert traced._sum(copy) == traced.SOURCES
+    assert export_cache._sum(copy) == export_cache.SOURCES
     for path in sorted(copy.rglob("*")):
         if path.is_file():
             content = path.read_bytes()
             path.write_bytes(content + b"\n")
-            assert traced._sum(copy) != traced.SOURCES, path
+            assert export_cache._sum(copy) != export_cache.SOURCES, path
             path.write_bytes(content)
 
 
 def test_pretrained_weights_are_read_to_the_last_bit():
-    robot = crew.trained()
+    robot = assembly.trained()
     stored = load_file(paths.PRETRAINED / "controller.safetensors")
     learned = robot.controller.driver.drivers[1]
     np.testing.assert_array_equal(learned.input_mean, stored["input_mean"])
@@ -58,11 +62,11 @@ def test_pretrained_weights_are_read_to_the_last_bit():
 
 @pytest.mark.usefixtures("float32")
 def test_a_run_folder_gives_its_robot():
-    robot = crew.trained(RUN / "fit-gait", RUN / "train")
+    robot = assembly.trained(RUN / "fit-gait", RUN / "train")
     stored = load_file(RUN / "train" / "controller.safetensors")
     np.testing.assert_array_equal(robot.controller.driver.drivers[1].output_scale, stored["output_scale"])
     assert not shaping.load(RUN / "fit-gait" / "shaping.safetensors").literal
-    detector = collect.load_detector(RUN / "collect")
+    detector = assembly.load_detector(RUN / "collect")
     assert float(detector.threshold) == float(robot.controller.lgmd.threshold)
 
 
@@ -81,11 +85,13 @@ def test_an_episode_gives_its_walks():
 @pytest.mark.usefixtures("float32")
 def test_a_checkpoint_is_carried_on_from(tmp_path, monkeypatch):
     """The fit is done, so nothing is left to learn: what comes out is what the checkpoint holds."""
-    monkeypatch.setattr(training, "_advance", lambda *_: pytest.fail("the checkpoint was not read"))
+    monkeypatch.setattr(behaviour_cloning, "_advance", lambda *_: pytest.fail("the checkpoint was not read"))
     shutil.copytree(OLD / "checkpoints", tmp_path / "checkpoints")
     first, second = episodes.read(RUN / "collect" / "episodes")
     untrained = navigator.create(jax.random.key(0), units=4)
-    settings = training.Settings(epochs=4, window=20, streams=2)
-    fit = training.fit(untrained, [first], [second], settings, checkpoints=tmp_path / "checkpoints", show=False)
+    settings = behaviour_cloning.Settings(epochs=4, window=20, streams=2)
+    fit = behaviour_cloning.fit(
+        untrained, [first], [second], settings, checkpoints=tmp_path / "checkpoints", show=False
+    )
     fitted, _ = navigator.load(OLD / "fitted.safetensors")
     jax.tree.map(np.testing.assert_array_equal, fit.params, fitted)

@@ -14,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lgmdjax import braitenberg, controller, cpg, drivers, lgmd, navigator, shaping
+from lgmdjax.control import braitenberg, controller, navigator, policies
+from lgmdjax.detectors import lgmd
+from lgmdjax.locomotion import cpg, shaping
 
 STEPS = 4
 
@@ -66,17 +68,17 @@ def guided() -> controller.Params:
 
 
 def open_nerves(params: controller.Params, frames: Any) -> controller.State:
-    return controller.init(params, frames, drivers.LEARNED, jax.random.key(0))
+    return controller.init(params, frames, policies.LEARNED, jax.random.key(0))
 
 
-def looks(_: np.random.Generator) -> drivers.Senses:
+def looks(_: np.random.Generator) -> policies.Senses:
     """Frames quiet enough for a command within the gait's range, and so unlike that both its ends are met."""
     u = jnp.asarray([[0.52, 0.55], [0.9, 0.55], [0.6, 0.7], [0.8, 0.85]], dtype=float)
     nothing = jnp.zeros_like(u)
-    return drivers.Senses(u=u, feed_forward=nothing, excitation=nothing, distances=nothing)
+    return policies.Senses(u=u, feed_forward=nothing, excitation=nothing, distances=nothing)
 
 
-def driven(driver: drivers.Driver, params: Callable[[], Any], flat: tuple[str, ...] = ()) -> Component:
+def driven(driver: policies.Driver, params: Callable[[], Any], flat: tuple[str, ...] = ()) -> Component:
     return Component(
         driver.name, params, lambda params, _: driver.init(params, jax.random.key(4)), driver.step, looks, flat
     )
@@ -129,18 +131,18 @@ COMPONENTS = (
         navigator.step,
         between(0.5, 1.0, 2),
     ),
-    driven(drivers.BLIND, lambda: drivers.Blind(velocity=jnp.asarray([1.2, 1.1]))),
+    driven(policies.BLIND, lambda: policies.Blind(velocity=jnp.asarray([1.2, 1.1]))),
     driven(
-        drivers.DIRECT,
-        lambda: drivers.Direct(rule=braitenberg.Params(), gain=jnp.asarray(10.0)),
+        policies.DIRECT,
+        lambda: policies.Direct(rule=braitenberg.Params(), gain=jnp.asarray(10.0)),
         flat=("near", "close", "full_turn", "symmetry", "steady", "first_side"),  # the teacher's own departures
     ),
-    driven(drivers.RANDOM, lambda: drivers.Replay(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0], [1.2, 0.9]]))),
+    driven(policies.RANDOM, lambda: policies.Replay(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0], [1.2, 0.9]]))),
     Component(
         "controller",
         guided,
         open_nerves,
-        lambda params, state, frames: controller.step(params, state, frames, drivers.LEARNED, 1 / 30),
+        lambda params, state, frames: controller.step(params, state, frames, policies.LEARNED, 1 / 30),
         pictures(2, 12, 16),
         plain=False,
     ),

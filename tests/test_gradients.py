@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from slopes import assert_three_ways_agree
 
-from lgmdjax import cpg, hexapod, legs, lgmd, navigator, shaping
+from lgmdjax.body import hexapod
+from lgmdjax.control import navigator
+from lgmdjax.detectors import lgmd
+from lgmdjax.locomotion import cpg, kinematics, shaping
 
 RNG = np.random.default_rng(7)
 
@@ -65,7 +68,10 @@ def test_window_of_the_navigator(variant):
 
 
 def test_kinematics_of_the_legs():
-    geometry, angles = legs.geometry(hexapod.load()), jnp.asarray(hexapod.stance() + RNG.uniform(-0.3, 0.3, (6, 3)))
-    assert_three_ways_agree(lambda angles: weighed(legs.forward(geometry, angles)), angles)
-    feet = legs.forward(geometry, angles)
-    assert_three_ways_agree(lambda feet: weighed(legs.inverse(geometry, feet)), feet)
+    geometry, angles = (
+        kinematics.geometry(hexapod.load()),
+        jnp.asarray(hexapod.stance() + RNG.uniform(-0.3, 0.3, (6, 3))),
+    )
+    assert_three_ways_agree(lambda angles: weighed(kinematics.forward(geometry, angles)), angles)
+    feet = kinematics.forward(geometry, angles)
+    assert_three_ways_agree(lambda feet: weighed(kinematics.inverse(geometry, feet)), feet)

@@ -7,7 +7,11 @@ import jax
 import numpy as np
 import pytest
 
-from lgmdjax import braitenberg, camera, drivers, hexapod, rollout, scenes, simulation
+from lgmdjax.body import hexapod
+from lgmdjax.control import braitenberg, policies
+from lgmdjax.sensors import camera
+from lgmdjax.simulation import closed_loop, rollout, room_batches
+from lgmdjax.world import scenes
 
 pytestmark = pytest.mark.usefixtures("float32")
 TEACHER = braitenberg.Params()
@@ -15,12 +19,12 @@ RULE = {"full_turn": 0.0, "symmetry": 0.0}  # eq. 22 within the gait's range
 
 
 @cache  # two tests look at the walks of the same rule
-def walked(**changes: float) -> simulation.Record:
+def walked(**changes: float) -> closed_loop.Record:
     """Put eight robots into the middle of the paper's training room, each turned its own way, for a minute."""
     teacher = replace(TEACHER, **changes)
-    params = simulation.assemble(teacher, teacher=teacher, eyes=camera.Params(width=16, height=12))
-    rooms = rollout.copies(jax.random.key(0), scenes.training_room(), 8)
-    chunks = rollout.chunks(params, hexapod.build(), rooms, drivers.TEACHER, 60.0, draw=False)
+    params = closed_loop.assemble(teacher, teacher=teacher, eyes=camera.Params(width=16, height=12))
+    rooms = room_batches.copies(jax.random.key(0), scenes.training_room(), 8)
+    chunks = rollout.chunks(params, hexapod.build(), rooms, policies.TEACHER, 60.0, draw=False)
     return rollout.together(list(chunks))
 
 

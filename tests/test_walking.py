@@ -7,7 +7,9 @@ import pytest
 from reference import walking as reference
 from scipy.spatial.transform import Rotation
 
-from lgmdjax import cpg, gait, hexapod, lesson, shaping, treadmill
+from lgmdjax.body import hexapod
+from lgmdjax.evaluation import gait_test
+from lgmdjax.locomotion import cpg, gait_fit, shaping, tripod_gait
 
 STEP = 1 / 180
 CYCLE = round(cpg.CYCLE_TIME / STEP)
@@ -106,8 +108,8 @@ def test_walks_after_a_random_start_of_the_rhythm():
 
 
 def test_the_papers_input_hardly_walks():
-    geometry = gait.geometry(hexapod.load())
-    networks = lesson.teach(geometry, steps=300, candidates=6, literal=True)
+    geometry = tripod_gait.geometry(hexapod.load())
+    networks = gait_fit.teach(geometry, steps=300, candidates=6, literal=True)
     assert abs(reference.walk(targets(1.0, 1.0, networks=networks)).speed) < 0.012
 
 
@@ -116,7 +118,7 @@ def test_mjx_walks_as_mujoco_does():
     """The same targets for three seconds: the same way, turn and sway, step for step."""
     model, commands = hexapod.build(hexapod.load()), ((1.0, 1.0), (-1.0, 1.0), (2.0, 2.0))
     courses = jnp.stack([targets(*v, seconds=3.0) for v in commands])
-    for walk, course in zip(treadmill.walk_mjx(model, courses), courses, strict=True):
+    for walk, course in zip(gait_test.walk_mjx(model, courses), courses, strict=True):
         theirs = reference.walk(course, settled=1.0)
         turned = Rotation.from_quat(np.repeat(walk.quaternion[:, [1, 2, 3, 0]], 6, axis=0))
         feet = walk.position[:, None] + turned.apply(walk.feet.reshape(-1, 3)).reshape(walk.feet.shape)

@@ -2,8 +2,8 @@
 
 Asks it twice, for eyes that look at half of their picture (0.5) up to all of it (1.0):
 
-- Walks that `lgmdjax collect` recorded are drawn once more, and scored as `lgmdjax.calibration` does: by how well the
-  difference of the two u, averaged over about a gait cycle, follows the difference of nearness.
+- Walks that `lgmdjax collect` recorded are drawn once more, and scored as `lgmdjax.learning.lgmd_grid_search` does: by
+  how well the difference of the two u, averaged over about a gait cycle, follows the difference of nearness.
 - Blind robots walk straight at the tube of fig. 14. In which share of the walks is the eye on its side the louder,
   while it is `AHEAD` away? What both eyes see tells nothing about sides, and from afar that is all that is ahead.
 """
@@ -15,10 +15,17 @@ import jax
 import numpy as np
 import tyro
 
-from lgmdjax import arena, calibration, camera, drivers, episodes, hexapod, lgmd, scales, trials
-from lgmdjax.files import read_json
-from lgmdjax.simulation import Params, Record
-from lgmdjax.stages import collect, crew
+from lgmdjax.body import hexapod
+from lgmdjax.control import policies
+from lgmdjax.detectors import lgmd
+from lgmdjax.evaluation import trials
+from lgmdjax.learning import lgmd_grid_search
+from lgmdjax.runtime.storage import read_json
+from lgmdjax.sensors import camera
+from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.simulation import assembly, episodes, recording, room_batches
+from lgmdjax.simulation.closed_loop import Params, Record
+from lgmdjax.world import arena
 
 OVERLAPS = (0.5, 0.6, 0.7, 0.8, 1.0)
 AHEAD = (0.9, 0.7)  # m, from the trunk to the middle of the tube
@@ -38,16 +45,19 @@ def main(
     """
     facts = read_json(run / "run.json")
     settings, seed = facts["settings"]["collect"], facts["seed"]
-    robot = crew.robot(
-        run / "fit-gait", scales.Eyes(**settings["eyes"]), collect.load_detector(run / "collect"), crew.everyone()
+    robot = assembly.robot(
+        run / "fit-gait",
+        CameraSettings(**settings["eyes"]),
+        assembly.load_detector(run / "collect"),
+        assembly.everyone(),
     )
     walks, numbers = episodes.read(run / "collect" / "episodes"), range(settings["episodes"])
     records = [episodes.batched([walk for walk in walks if walk.episode == number][:robots]) for number in numbers]
-    rooms = [crew.rooms_of(seed, number, settings["robots"]).arena for number in numbers]
+    rooms = [room_batches.rooms_of(seed, number, settings["robots"]).arena for number in numbers]
     rooms = jax.tree.map(lambda leaf: leaf[:robots], rooms)
     rows: list[tuple[str, ...]] = [("overlap", *(f"episode {number}" for number in numbers), "tube")]
     for overlap in overlaps:
-        looking = crew.with_eyes(robot, scales.Eyes(**settings["eyes"] | {"overlap": overlap}))
+        looking = assembly.with_eyes(robot, CameraSettings(**settings["eyes"] | {"overlap": overlap}))
         detector, eyes = looking.controller.lgmd, looking.camera
         scores = [score(detector, eyes, *walked) for walked in zip(rooms, records, strict=True)]
         rows.append((f"{overlap:g}", *(f"{number:.3f}" for number in (*scores, told_apart(looking, seeds, seed)))))
@@ -57,16 +67,16 @@ def main(
 
 def score(detector: lgmd.Params, eyes: camera.Params, rooms: arena.Arena, record: Record) -> float:
     """Correlate left minus right u with left minus right nearness, over recorded walks."""
-    alone = calibration.grid([float(detector.threshold)], [float(detector.inhibition)])
-    u, feed_forward = calibration.survey(detector, eyes, rooms, record, alone)
-    return calibration.choose(record, np.asarray(u), np.asarray(feed_forward), alone).table[0]["score"]
+    alone = lgmd_grid_search.grid([float(detector.threshold)], [float(detector.inhibition)])
+    u, feed_forward = lgmd_grid_search.survey(detector, eyes, rooms, record, alone)
+    return lgmd_grid_search.choose(record, np.asarray(u), np.asarray(feed_forward), alone).table[0]["score"]
 
 
 def told_apart(robot: Params, seeds: int, seed: int) -> float:
     """Walk straight at the tube; give the share of the walks in which the eye on its side is the louder."""
     rooms = trials.draw_rooms("tube", seeds, seed)
-    blind = crew.seat(robot, drivers.BLIND)
-    crowds = crew.crowds(blind, hexapod.build(), rooms, SECONDS, f"overlap {robot.camera.overlap:g}")
+    blind = assembly.seat(robot, policies.BLIND)
+    crowds = recording.crowds(blind, hexapod.build(), rooms, SECONDS, f"overlap {robot.camera.overlap:g}")
     side = np.asarray(rooms.arena.handedness)  # 1: the tube is to the left
     aside = np.resize(np.repeat(trials.LATERALS, 2), len(side)) > 0
     louder = []

@@ -32,23 +32,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lgmdjax import (
-    apprentice,
-    cpg,
-    drivers,
-    episodes,
-    figures,
-    files,
-    navigator,
-    programs,
-    scales,
-    scores,
-    simulation,
-    training,
-)
-from lgmdjax.episodes import Walk
-from lgmdjax.simulation import FRAME_RATE
-from lgmdjax.stages import crew
+from lgmdjax.control import navigator, policies
+from lgmdjax.evaluation import metrics
+from lgmdjax.learning import behaviour_cloning, dagger
+from lgmdjax.locomotion import cpg
+from lgmdjax.reporting.figures import style
+from lgmdjax.runtime import compiled_code, storage
+from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.simulation import assembly, closed_loop, episodes, recording
+from lgmdjax.simulation.closed_loop import FRAME_RATE
+from lgmdjax.simulation.episodes import Walk
+from lgmdjax.simulation.settings import BenchmarkRooms
+from lgmdjax.studies.settings import SensitivitySettings
 
 THRESHOLDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # grey, and the chosen one
 SUPPRESSIONS = (0.1, 0.2, 0.4, 0.7, 1.0, 2.0)
@@ -77,39 +72,39 @@ AXES = {
 }
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Sensitivity, seed: int) -> None:
+def work(folder: Path, inputs: Mapping[str, Path], settings: SensitivitySettings, seed: int) -> None:
     """Score the robot with every change, and every pupil."""
-    robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
-    recorded = apprentice.recorded_by(inputs)  # before hours of walking
+    robot = assembly.with_eyes(assembly.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+    recorded = dagger.recorded_by(inputs)  # before hours of walking
     frames = sum(map(len, episodes.stretches(recorded)))
     rows, chosen = [], settled(robot, settings.bench.eyes)
     for _, same in groupby(changes(robot, settings.bench.eyes), key=itemgetter(0)):
         for axis, value, changed, contrast in same:
             rows.append(_score(folder, changed, settings.bench, seed, axis, value, contrast=contrast))
-        programs.let_go()  # other eyes have their own
+        compiled_code.let_go()  # other eyes have their own
     for axis, value, walks in lessons(recorded, seed):
         epochs = fair(settings.epochs, frames, sum(map(len, walks)))
         for start in range(settings.seeds):
             place = folder / "pupils" / f"{axis}-{value:g}-{start}"
-            pupil = crew.manned(robot, _fit(place, walks, epochs, seed + start))
+            pupil = assembly.manned(robot, _fit(place, walks, epochs, seed + start))
             rows.append(_score(folder, pupil, settings.bench, seed, axis, value, start=start))
-        programs.let_go()  # and so has each amount of data
+        compiled_code.let_go()  # and so has each amount of data
     rows = [row | {"chosen": row["value"] == chosen.get(row["axis"])} for row in rows]
-    files.write_json(folder / "sensitivity.json", rows)
+    storage.write_json(folder / "sensitivity.json", rows)
 
 
-def settled(robot: simulation.Params, eyes: scales.Eyes) -> dict[str, float]:
+def settled(robot: closed_loop.Params, eyes: CameraSettings) -> dict[str, float]:
     """Name the value of each axis that the robot of a bench has by itself."""
     threshold = round(float(robot.controller.lgmd.threshold), 6)  # as it was before it became a float32
     own = {"T_s": threshold, "overlap": eyes.overlap, "pixels": eyes.width, "cell": eyes.pooling, "rate": FRAME_RATE}
     return own | dict.fromkeys(("T_f", "contrast", "sway"), 1.0)
 
 
-def changes(robot: simulation.Params, eyes: scales.Eyes) -> Iterator[tuple[str, float, simulation.Params, float]]:
+def changes(robot: closed_loop.Params, eyes: CameraSettings) -> Iterator[tuple[str, float, closed_loop.Params, float]]:
     """Yield (axis, value, robot, contrast of the rooms) for everything that is changed without teaching."""
     detector = robot.controller.lgmd
 
-    def seeing(**constants: Any) -> simulation.Params:
+    def seeing(**constants: Any) -> closed_loop.Params:
         return replace(robot, controller=replace(robot.controller, lgmd=replace(detector, **constants)))
 
     for threshold in sorted({*THRESHOLDS, settled(robot, eyes)["T_s"]}):
@@ -117,12 +112,12 @@ def changes(robot: simulation.Params, eyes: scales.Eyes) -> Iterator[tuple[str, 
     for factor in SUPPRESSIONS:
         yield "T_f", factor, seeing(suppression=factor * detector.suppression), 1.0
     for overlap in OVERLAPS:
-        yield "overlap", overlap, crew.with_eyes(robot, replace(eyes, overlap=overlap)), 1.0
+        yield "overlap", overlap, assembly.with_eyes(robot, replace(eyes, overlap=overlap)), 1.0
     for width, height, pooling in SIZES:
         other = replace(eyes, width=width, height=height, pooling=pooling)
-        yield "pixels", width, crew.with_eyes(robot, other), 1.0
+        yield "pixels", width, assembly.with_eyes(robot, other), 1.0
     for pooling in CELLS:
-        yield "cell", pooling, crew.with_eyes(robot, replace(eyes, pooling=pooling)), 1.0
+        yield "cell", pooling, assembly.with_eyes(robot, replace(eyes, pooling=pooling)), 1.0
     for frames in EVERY:
         yield "rate", FRAME_RATE / frames, replace(robot, every=jnp.asarray(frames, jnp.int32)), 1.0
     for contrast in CONTRASTS:
@@ -188,24 +183,26 @@ def _fit(folder: Path, walks: list[Walk], epochs: int, seed: int) -> navigator.P
     """Fit a pupil; the last eighth of every stretch chooses the best epoch, since a few rooms cannot be parted."""
     train = [walk[: max(7 * len(walk) // 8, 1)] for walk in walks]
     test = [walk[7 * len(walk) // 8 :] for walk in walks]
-    start, settings = navigator.create(jax.random.key(seed)), training.Settings(epochs=epochs)
-    return training.enliven(training.fit(start, train, test, settings, checkpoints=folder).best, test)
+    start, settings = navigator.create(jax.random.key(seed)), behaviour_cloning.Settings(epochs=epochs)
+    return behaviour_cloning.enliven(behaviour_cloning.fit(start, train, test, settings, checkpoints=folder).best, test)
 
 
 def _score(
-    folder: Path, robot: simulation.Params, bench: scales.Bench, seed: int, axis: str, value: float, *,
+    folder: Path, robot: closed_loop.Params, bench: BenchmarkRooms, seed: int, axis: str, value: float, *,
     contrast: float = 1.0, **facts: Any,
 ) -> dict[str, Any]:  # fmt: skip
     name = "-".join(f"{x:g}" if isinstance(x, float) else str(x) for x in (axis, float(value), *facts.values()))
-    record = crew.benched(folder / "walks" / name, robot, bench, drivers.LEARNED, seed, label=name, contrast=contrast)
-    return {"axis": axis, "value": value, **facts} | asdict(scores.score(record, cpg.CYCLE_TIME))
+    record = recording.benched(
+        folder / "walks" / name, robot, bench, policies.LEARNED, seed, label=name, contrast=contrast
+    )
+    return {"axis": axis, "value": value, **facts} | asdict(metrics.score(record, cpg.CYCLE_TIME))
 
 
-@figures.styled
+@style.styled
 def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw collisions per 100 m against every axis, with intervals, and the speed; the chosen value is ringed."""
     axes_of = [axis for axis in AXES if any(row["axis"] == axis for row in rows)]
-    figure = Figure(figsize=(figures.WIDTH, 0.4 + 1.75 * ((len(axes_of) + 1) // 2)), layout="constrained")
+    figure = Figure(figsize=(style.WIDTH, 0.4 + 1.75 * ((len(axes_of) + 1) // 2)), layout="constrained")
     panels = np.ravel(figure.subplots((len(axes_of) + 1) // 2, 2, sharey=True))
     for number, (panel, axis) in enumerate(zip(panels, axes_of, strict=False)):
         some = [row for row in rows if row["axis"] == axis]
@@ -219,29 +216,29 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
     for panel in panels[len(axes_of) :]:
         panel.remove()
     panels[0].set_ylim(0, min(panels[0].get_ylim()[1], MOST))
-    figure.supylabel("collisions per 100 m", fontsize=8.5, color=figures.LEFT)
+    figure.supylabel("collisions per 100 m", fontsize=8.5, color=style.LEFT)
     return figure
 
 
 def _rates(panel: Axes, x: np.ndarray, rows: Sequence[Mapping[str, Any]]) -> None:
     """Draw rates with their intervals; arrows stand for more than fits."""
     rates = np.array([[row["per_100_m"][key] for key in ("value", "low", "high")] for row in rows])
-    style = {"color": figures.LEFT, "clip_on": False, "zorder": 3}
-    panel.vlines(x, rates[:, 1], rates[:, 2], color=figures.LEFT, alpha=0.45, linewidth=1.6)
+    look = {"color": style.LEFT, "clip_on": False, "zorder": 3}
+    panel.vlines(x, rates[:, 1], rates[:, 2], color=style.LEFT, alpha=0.45, linewidth=1.6)
     for there, marker in ((rates[:, 0] <= MOST, "o"), (rates[:, 0] > MOST, "^")):
         if there.any():  # the layout has no place for a line without points
-            panel.plot(x[there], np.minimum(rates[there, 0], MOST), marker, markersize=4, **style)
+            panel.plot(x[there], np.minimum(rates[there, 0], MOST), marker, markersize=4, **look)
     ringed = np.array([row["chosen"] for row in rows])
     if ringed.any():
         panel.plot(
-            x[ringed], rates[ringed, 0], "o", markersize=9, markerfacecolor="none", color=figures.INK, clip_on=False
+            x[ringed], rates[ringed, 0], "o", markersize=9, markerfacecolor="none", color=style.INK, clip_on=False
         )
 
 
 def _speeds(panel: Axes, x: np.ndarray, rows: Sequence[Mapping[str, Any]], *, labelled: bool) -> None:
     """Draw the speed behind: a robot that turns all the time touches nothing, and gets nowhere."""
     speeds = panel.twinx()
-    speeds.plot(x, [100 * row["speed"] for row in rows], "_", color=figures.INK, markersize=9, alpha=0.6)
+    speeds.plot(x, [100 * row["speed"] for row in rows], "_", color=style.INK, markersize=9, alpha=0.6)
     speeds.set(ylim=(0, 10), ylabel="speed [cm/s]" if labelled else "")
     speeds.tick_params(right=labelled, labelright=labelled)
     speeds.grid(False)

@@ -25,12 +25,21 @@ from jaxtyping import Array, Bool, Float
 from matplotlib.figure import Figure
 from scipy import ndimage
 
-from lgmdjax import arena, calibration, cpg, drivers, figures, files, gait, hexapod, laser, scales, scores, simulation
-from lgmdjax.stages import crew
+from lgmdjax.body import hexapod
+from lgmdjax.control import policies
+from lgmdjax.evaluation import metrics
+from lgmdjax.locomotion import cpg, tripod_gait
+from lgmdjax.reporting.figures import style
+from lgmdjax.runtime import storage
+from lgmdjax.sensors import laser
+from lgmdjax.simulation import assembly, closed_loop, recording, room_batches
+from lgmdjax.simulation.settings import BenchmarkRooms
+from lgmdjax.studies.settings import VelocitySettings
+from lgmdjax.world import arena
 
 NEAR, FAR = 0.6, 1.2  # m
 SECTOR = math.radians(40.0)  # straight ahead
-WINDOW = round(calibration.AVERAGED * simulation.FRAME_RATE)
+WINDOW = round(metrics.AVERAGED * closed_loop.FRAME_RATE)
 LEAST = 10.0  # s of a walk, however fast
 RESAMPLED = 1000
 BAND = (1.0, 1.4)  # of the nominal velocity: where the paper finds the two furthest apart
@@ -54,28 +63,28 @@ class Row:
     lost: int  # robots that fell
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: scales.Velocity, seed: int) -> None:
+def work(folder: Path, inputs: Mapping[str, Path], settings: VelocitySettings, seed: int) -> None:
     """Walk at every velocity through the same rooms, and compare."""
-    robot = crew.with_eyes(crew.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
+    robot = assembly.with_eyes(assembly.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
     measured = []
     for velocity in settings.velocities:
-        seconds = max(settings.metres / (velocity * float(gait.Gait().nominal_velocity)), LEAST)
-        bench = scales.Bench(eyes=settings.eyes, robots=settings.robots, seconds=seconds)
-        record = crew.benched(
-            folder / f"{velocity:g}", at_velocity(robot, velocity), bench, drivers.BLIND, seed,
+        seconds = max(settings.metres / (velocity * float(tripod_gait.Gait().nominal_velocity)), LEAST)
+        bench = BenchmarkRooms(eyes=settings.eyes, robots=settings.robots, seconds=seconds)
+        record = recording.benched(
+            folder / f"{velocity:g}", at_velocity(robot, velocity), bench, policies.BLIND, seed,
             label=f"v = {velocity:g}", draw=True,
         )  # fmt: skip
-        free = ahead(crew.bench_rooms(bench, seed).arena, record)
+        free = ahead(room_batches.bench_rooms(bench, seed).arena, record)
         measured.append(measure(velocity, record, free, float(robot.controller.lgmd.suppression)))
-    files.write_json(folder / "velocity.json", [asdict(row) for row in compared(measured)])
+    storage.write_json(folder / "velocity.json", [asdict(row) for row in compared(measured)])
 
 
-def at_velocity(robot: simulation.Params, velocity: float) -> simulation.Params:
+def at_velocity(robot: closed_loop.Params, velocity: float) -> closed_loop.Params:
     """Have the blind driver walk straight on at a velocity."""
-    return crew.manned(robot, drivers.Blind(velocity=jnp.full(2, velocity, dtype=float)))
+    return assembly.manned(robot, policies.Blind(velocity=jnp.full(2, velocity, dtype=float)))
 
 
-def ahead(rooms: arena.Arena, record: simulation.Record) -> Float[np.ndarray, "robots frames"]:
+def ahead(rooms: arena.Arena, record: closed_loop.Record) -> Float[np.ndarray, "robots frames"]:
     """Measure how far it is from the laser to the first thing in a sector straight ahead [m]."""
     scanner = laser.Params(rays=21, field_of_view=SECTOR)
 
@@ -89,7 +98,7 @@ def ahead(rooms: arena.Arena, record: simulation.Record) -> Float[np.ndarray, "r
 
 
 def measure(
-    velocity: float, record: simulation.Record, ahead: Float[np.ndarray, "robots frames"], suppression: float
+    velocity: float, record: closed_loop.Record, ahead: Float[np.ndarray, "robots frames"], suppression: float
 ) -> tuple[Row, Float[np.ndarray, " resamples"]]:
     """Compare u where something is near ahead with u where nothing is; give d of the resamples too."""
     u = ndimage.uniform_filter1d(np.asarray(record.u).mean(axis=-1), WINDOW, axis=1)
@@ -99,7 +108,7 @@ def measure(
     chosen = np.random.default_rng(0).integers(0, len(u), (RESAMPLED, len(u)))
     effects = np.array([_compare(near[some].sum(axis=0), far[some].sum(axis=0))[-1] for some in chosen])
     low, high = np.nanpercentile(effects, (2.5, 97.5)) if np.any(np.isfinite(effects)) else (math.nan, math.nan)
-    scored, silenced = scores.score(record, cpg.CYCLE_TIME), np.asarray(record.feed_forward)[steady] > suppression
+    scored, silenced = metrics.score(record, cpg.CYCLE_TIME), np.asarray(record.feed_forward)[steady] > suppression
     row = Row(
         velocity=velocity,
         speed=scored.speed,
@@ -143,12 +152,12 @@ def _compare(near: np.ndarray, far: np.ndarray) -> tuple[float, float, float, fl
     return float(means[0]), float(means[1]), spread, float((means[0] - means[1]) / max(spread, 1e-9))
 
 
-def _steady(record: simulation.Record) -> Bool[np.ndarray, "robots frames"]:
+def _steady(record: closed_loop.Record) -> Bool[np.ndarray, "robots frames"]:
     """Leave out the first two seconds after a robot was put down, the frames before a touch, and robots that fell."""
     setbacks = np.asarray(record.setbacks)
     steady = np.zeros(setbacks.shape, bool)
-    for robot, first, last in scores.stretches(setbacks):
-        steady[robot, first + 2 * round(simulation.FRAME_RATE) : max(last - WINDOW, 0)] = True
+    for robot, first, last in metrics.stretches(setbacks):
+        steady[robot, first + 2 * round(closed_loop.FRAME_RATE) : max(last - WINDOW, 0)] = True
     return steady & np.asarray(record.ok)
 
 
@@ -161,24 +170,24 @@ def _furthest(effects: Sequence[float]) -> int:
     return int(np.argmax(np.where(np.isfinite(effects), effects, -math.inf)))
 
 
-@figures.styled
+@style.styled
 def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the mean responses with their spread, and how far apart they are; rows as in velocity.json."""
     names = ("velocity", "spread", "effect", "low", "high")
     velocity, spread, effect, low, high = (np.array([row[name] for row in rows]) for name in names)
-    figure = Figure(figsize=(figures.WIDTH, 4.4), layout="constrained")
+    figure = Figure(figsize=(style.WIDTH, 4.4), layout="constrained")
     means, effects = figure.subplots(2, sharex=True)
-    for name, colour in (("obstructed", figures.RIGHT), ("free", figures.LEFT)):
+    for name, colour in (("obstructed", style.RIGHT), ("free", style.LEFT)):
         mean: Float[np.ndarray, " rows"] = np.array([row[name] for row in rows])
         means.plot(velocity, mean, "o-", color=colour, label=f"{name} path")
         means.fill_between(velocity, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
     means.set(ylabel="mean response u")
     means.legend()
     good = np.array([row["as_good"] for row in rows])
-    effects.plot(velocity, effect, "o-", color=figures.INK, markerfacecolor="white", label="worse than the best")
-    effects.plot(velocity[good], effect[good], "o", color=figures.INK, label="as good as the best")
-    effects.fill_between(velocity, low, high, color=figures.INK, alpha=0.12, linewidth=0)
-    effects.axvspan(*BAND, color=figures.FAINT, alpha=0.5, linewidth=0, label="the paper's best")
+    effects.plot(velocity, effect, "o-", color=style.INK, markerfacecolor="white", label="worse than the best")
+    effects.plot(velocity[good], effect[good], "o", color=style.INK, label="as good as the best")
+    effects.fill_between(velocity, low, high, color=style.INK, alpha=0.12, linewidth=0)
+    effects.axvspan(*BAND, color=style.FAINT, alpha=0.5, linewidth=0, label="the paper's best")
     effects.set(xlabel="velocity [0.05 m/s]", ylabel="Cohen's d", xscale="log")
     effects.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     effects.legend()

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from lgmdjax.arena import Arena
+from lgmdjax.world.arena import Arena
 
 
 def to_mjcf(arena: Arena) -> str:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lgmdjax.texture import PHASES, WAVES, WEIGHTS
+from lgmdjax.world.texture import PHASES, WAVES, WEIGHTS
 
 
 class Picture(NamedTuple):

@@ -1,0 +1,1 @@
+"""Looming detectors: `Params`, `State`, `init`, `step` (eqs. 7-16)."""

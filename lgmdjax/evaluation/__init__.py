@@ -1,0 +1,1 @@
+"""The paper's trials and the metrics of their outcome."""

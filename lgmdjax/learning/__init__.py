@@ -1,0 +1,1 @@
+"""Fits: of the navigator, the detector, and of any controller parameter through the rollout."""

@@ -1,0 +1,1 @@
+"""The stages of `lgmdjax reproduce`, their settings at three scales, and the report page."""

@@ -1,0 +1,148 @@
+"""How much of everything: the settings of each stage at the three scales.
+
+`smoke` goes through every stage in minutes and proves nothing about the robot; `quick` is the smallest that
+shows the result; `paper` uses the paper's figures (15 minutes of the teacher, 1000 epochs of its halves, 235.3 m) and
+more walks, and adds the studies of `lgmdjax.studies`: a stage that a scale has no settings for is left out. A setting
+stands here when the scale or an experiment changes it; physical numbers belong to the components' `Params`.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from lgmdjax.evaluation.settings import TrialPlan
+from lgmdjax.learning.settings import LgmdGradientSettings, TrainSettings
+from lgmdjax.pipeline.settings import CollectSettings, EvaluateSettings, FitGaitSettings, ReportSettings
+from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.simulation.settings import BenchmarkRooms
+from lgmdjax.studies.settings import (
+    ErrataSettings,
+    FailureModesSettings,
+    FinetuneSettings,
+    GaitGradientSettings,
+    GradientHorizonSettings,
+    SensitivitySettings,
+    SupervisionSettings,
+    VelocitySettings,
+)
+
+Scale = Literal["smoke", "quick", "paper"]
+
+_SMALL = CameraSettings(width=64, height=48, pooling=2)
+_QUICK = CameraSettings(width=80, height=60, pooling=3)
+_SMALLER = CameraSettings(width=160, height=120, pooling=6)
+_PAPER = CameraSettings(width=320, height=240, pooling=12)
+
+SCALES: Mapping[Scale, Mapping[str, Any]] = {
+    "smoke": {
+        "fit-gait": FitGaitSettings(steps=300, seconds=6),
+        "collect": CollectSettings(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=5),
+        "train": TrainSettings(
+            eyes=_SMALL,
+            epochs=5,
+            rounds=1,
+            round_epochs=5,
+            robots=4,
+            round_seconds=10,
+            halves_epochs=5,
+            variants=("lstm", "feed-forward", "mean"),
+        ),
+        "evaluate": EvaluateSettings(
+            places=(
+                TrialPlan(trial="testing", eyes=_SMALL, seeds=4, seconds=5),
+                TrialPlan(trial="unseen", eyes=_SMALL, seeds=4, seconds=5),
+            )
+        ),
+        "report": ReportSettings(video_seconds=1),
+    },
+    "quick": {
+        "fit-gait": FitGaitSettings(steps=3000, seconds=20),
+        "collect": CollectSettings(eyes=_QUICK, robots=16, episodes=2, seconds=45, calibration_seconds=20),
+        "train": TrainSettings(
+            eyes=_QUICK, epochs=80, rounds=3, round_epochs=60, robots=16, round_seconds=60, halves_epochs=80
+        ),
+        "evaluate": EvaluateSettings(
+            places=(
+                TrialPlan(trial="testing", eyes=_QUICK, seeds=16, seconds=20),
+                TrialPlan(trial="unseen", eyes=_QUICK, seeds=16, seconds=70),
+            )
+        ),
+        "report": ReportSettings(video_seconds=10),
+    },
+    "paper": {
+        "fit-gait": FitGaitSettings(steps=6000, seconds=20),
+        "collect": CollectSettings(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
+        "train": TrainSettings(
+            eyes=_QUICK,
+            epochs=100,
+            rounds=8,
+            round_epochs=60,
+            robots=32,
+            round_seconds=120,
+            halves_epochs=1000,
+            cautions=(1.5, 2.0, 2.5, 3.0),
+        ),
+        "evaluate": EvaluateSettings(
+            places=(
+                TrialPlan(trial="testing", eyes=_PAPER, coarse=_QUICK, seeds=5),
+                TrialPlan(trial="unseen", eyes=_QUICK, seeds=64),
+                TrialPlan(trial="tube", eyes=_PAPER, coarse=_QUICK, seeds=8),
+                TrialPlan(trial="indoor", eyes=_PAPER, coarse=_QUICK, seeds=12),
+                TrialPlan(trial="outdoor", eyes=_PAPER, coarse=_QUICK, seeds=10),
+                TrialPlan(trial="dynamic", eyes=_PAPER, coarse=_QUICK, seeds=10),
+                TrialPlan(trial="white", eyes=_QUICK, seeds=12),
+                TrialPlan(trial="corner", eyes=_QUICK, seeds=12),
+            )
+        ),
+        "velocity": VelocitySettings(eyes=_SMALLER, robots=16, metres=1.2),
+        "supervision": SupervisionSettings(
+            bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
+            practice=TrainSettings(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=60),
+            lesson_seconds=30,
+            seeds=3,
+        ),
+        "errata": ErrataSettings(bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=60)),
+        "failure_modes": FailureModesSettings(bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90)),
+        "sensitivity": SensitivitySettings(
+            bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=60), epochs=30, seeds=2
+        ),
+        "report": ReportSettings(video_seconds=30),
+    },
+}
+
+GRADIENTS: Mapping[str, Any] = {
+    "gradient_horizon": GradientHorizonSettings(eyes=_SMALL, robots=6),
+    # Of 1, 2 and 8 pairs, sigma 0.0003 to 0.02 and rates of 1.25e-3 to 1.5e-2 these serve the evolution strategy best.
+    "gait_gradient": GaitGradientSettings(
+        robot_seconds=9000.0,
+        window=1.6,
+        learning_rate=5e-3,
+        clip=1.0,
+        pairs=1,
+        sigma=1e-3,
+        evolution_rate=2.5e-3,
+        seeds=3,
+    ),
+    "lgmd_gradient": LgmdGradientSettings(
+        minutes=60.0,
+        seconds=28.0,
+        epochs=60,
+        steps=400,
+        every=25,
+        window=60,
+        streams=32,
+        learning_rate=1e-2,
+        navigator_rate=1e-3,
+        seeds=3,
+    ),
+    "closed_loop_finetune": FinetuneSettings(
+        bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
+        practice=TrainSettings(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=30),
+        lesson_seconds=30,
+        window=15,
+        horizons=(5, 45),
+        learning_rate=1e-2,
+        clip=10.0,
+        seeds=3,
+    ),
+}
+"""Settings of the studies of gradients through the walk; they are no stages of a run."""

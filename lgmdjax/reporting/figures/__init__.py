@@ -1,0 +1,1 @@
+"""Figures of the report and the notebooks: numbers in, a matplotlib `Figure` out."""

@@ -1,0 +1,1 @@
+"""Stereo fisheye camera, laser scanner, and laboratory stimuli for both eyes."""

@@ -1,0 +1,1 @@
+"""Robots in rooms: one frame, many frames, many robots, and recordings of them."""

@@ -1,0 +1,90 @@
+"""What is measured of a walk, on paths whose speed, turning and sway are known."""
+
+import numpy as np
+import pytest
+
+from lgmdjax.evaluation import gait_test
+
+CYCLE = 1.0  # s
+
+
+def course(
+    speed: float = 0.05,
+    turn: float = 0.0,
+    heading: float = 0.0,
+    seconds: float = 20.0,
+    *,
+    roll: float = 0.0,
+    pitch: float = 0.0,
+    yaw: float = 0.0,
+    bounce: float = 0.0,
+) -> gait_test.Course:
+    """A walk at a steady speed and turn, with sway of these amplitudes, each at its own phase of the cycle."""
+    t = np.arange(round(seconds / gait_test.STEP)) * gait_test.STEP
+    sway = lambda amplitude, phase: amplitude * np.sin(2 * np.pi * t / CYCLE + phase)  # noqa: E731
+    ways = heading + turn * t
+    steps = speed * gait_test.STEP * np.stack([np.cos(ways), np.sin(ways)], axis=1)
+    position = np.column_stack([np.cumsum(steps, axis=0), 0.1 + sway(bounce, 0.3)])
+    # Small angles, one after the other: yaw about z, pitch about y, roll about x.
+    quaternion = _product(_about(2, ways + sway(yaw, 0.7)), _about(1, sway(pitch, 1.1)), _about(0, sway(roll, 2.0)))
+    return gait_test.Course(position=position, quaternion=quaternion, feet=np.zeros((len(t), 6, 3)))
+
+
+def _about(axis: int, angle: np.ndarray) -> np.ndarray:
+    quaternion = np.zeros((len(angle), 4))
+    quaternion[:, 0], quaternion[:, 1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
+    return quaternion
+
+
+def _product(*factors: np.ndarray) -> np.ndarray:
+    product = factors[0]
+    for b in factors[1:]:
+        a = product
+        vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+        product = np.column_stack([a[:, 0] * b[:, 0] - np.sum(a[:, 1:] * b[:, 1:], axis=1), vector])
+    return product
+
+
+@pytest.mark.parametrize("speed", [0.05, -0.03, 0.0])
+@pytest.mark.parametrize("heading", [0.0, 2.0, np.pi])
+def test_speed_is_along_the_heading(speed, heading):
+    gauge = gait_test.gauge(course(speed, heading=heading), CYCLE)
+    assert gauge.speed == pytest.approx(speed, abs=1e-6)
+    assert gauge.yaw_rate == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("turn", [0.01, -0.01, 0.4, -0.4])
+def test_turning_is_counted_through_full_circles(turn):
+    """Positive to the left, 8 rad in 20 s at most; a drift is what the heading came to."""
+    gauge = gait_test.gauge(course(0.0, turn), CYCLE)
+    assert gauge.yaw_rate == pytest.approx(turn, abs=1e-6)
+    assert gauge.drift == pytest.approx(20 * turn, rel=1e-3)
+
+
+def test_sway_is_its_rms_about_the_mean_and_the_trend():
+    amplitudes = {"roll": 0.01, "pitch": 0.02, "yaw": 0.03, "bounce": 0.002}
+    for name, amplitude in amplitudes.items():
+        gauge = gait_test.gauge(course(0.05, 0.1, **{name: amplitude}), CYCLE)
+        assert getattr(gauge, name) == pytest.approx(amplitude / np.sqrt(2), rel=0.02), name
+        for other in amplitudes.keys() - {name}:
+            assert getattr(gauge, other) < 1e-3 * amplitude + 1e-6, (name, other)
+
+
+def test_sway_does_not_tilt_what_is_measured_of_the_way():
+    """Whole cycles only: one and a half cycles more or less of yawing is no turning, and no speed."""
+    for seconds in (10.0, 10.5, 11.3):
+        gauge = gait_test.gauge(course(0.05, seconds=seconds, yaw=0.05), CYCLE)
+        assert gauge.yaw_rate == pytest.approx(0, abs=1e-4)
+        assert gauge.speed == pytest.approx(0.05, rel=2e-3)
+
+
+def test_the_start_is_left_out():
+    """However the robot swings while its gait settles, the walk afterwards is what counts."""
+    steady, wild = course(), course(roll=0.3, pitch=0.2, bounce=0.05)
+    settling = np.arange(len(steady.position)) < round(gait_test.SETTLING / gait_test.STEP)
+    mixed = gait_test.Course(
+        position=np.where(settling[:, None], wild.position, steady.position),
+        quaternion=np.where(settling[:, None], wild.quaternion, steady.quaternion),
+        feet=steady.feet,
+    )
+    assert gait_test.gauge(mixed, CYCLE) == gait_test.gauge(steady, CYCLE)

@@ -1,0 +1,85 @@
+"""The paper's experiments: what robots are put before, and how it is judged whether they got through."""
+
+import jax
+import numpy as np
+import pytest
+from synthetic import walk
+
+from lgmdjax.evaluation import trials
+from lgmdjax.world import arena, scenes
+
+KEY = jax.random.key(8)
+SCENES = ("tube", "indoor", "outdoor", "dynamic", "white", "corner")
+TUBE = trials.TRIALS["tube"]
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    return {name: trials.TRIALS[name].rooms(KEY, 2) for name in SCENES}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_rooms_are_sound_and_starts_nearly_where_the_paper_has_them(rooms, name):
+    batch = rooms[name]
+    arena.validate(batch.arena)
+    np.testing.assert_array_equal(batch.starts[:, 0], batch.arena.start)
+    meant = np.array([0, 0, np.pi / 4 if name == "corner" else 0])
+    assert np.all(np.abs(np.abs(batch.arena.start) - meant) <= np.array(trials.LIBERTY) + 1e-12)
+    assert len(np.unique(batch.arena.start[:, 0])) > 1
+
+
+def test_tube_stands_at_fifteen_distances_to_either_side(rooms):
+    tubes = np.asarray(rooms["tube"].arena.cylinders.centre)[:, 0]
+    assert tubes.shape == (2 * 15 * 2, 2)
+    np.testing.assert_allclose(tubes[:, 0], 1.25)
+    sides = tubes[:, 1].reshape(2, 15, 2)
+    np.testing.assert_allclose(sides[..., 0], [np.linspace(0, 0.42, 15)] * 2, atol=1e-12)
+    np.testing.assert_allclose(sides[..., 1], -sides[..., 0])
+
+
+def test_every_second_room_is_a_mirror_image(rooms):
+    assert rooms["indoor"].arena.handedness.tolist() == [1, -1]
+    table = np.asarray(rooms["indoor"].arena.boxes.centre)[:, 2]
+    np.testing.assert_allclose(table[0] * [1, -1], table[1])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_texture_is_one_of_the_training_room(rooms, name):
+    known = np.asarray(scenes.training_room().boxes.texture)
+    seen = np.asarray(rooms[name].arena.boxes.texture).reshape(-1, 4)
+    assert not np.any(np.all(np.isclose(seen[:, None], known[None]), axis=-1))
+
+
+def test_a_robot_that_passes_has_got_through_whatever_it_touches_later():
+    """At 0.05 m/s it has passed the tube, by 0.4 m, after 33 s of 40."""
+    contact = np.zeros((2, 1200), bool)
+    contact[0, 1100], contact[1, 500] = True, True
+    clearance = np.full((2, 1200), 0.3)
+    clearance[0, 700], clearance[0, 1100], clearance[1, 500] = 0.1, 0.0, -0.01
+    outcome = trials.judge(TUBE, walk(contact=contact, clearance=clearance))
+    assert outcome.touched.tolist() == [False, True]
+    assert outcome.frames.tolist() == [pytest.approx(1.65 / 0.05 * 30, abs=2), 501]
+    np.testing.assert_allclose(outcome.clearance, [0.1, -0.01])
+    assert outcome.avoided().value == 0.5
+
+
+def test_a_robot_that_turns_back_has_retreated_and_one_that_is_lost_has_not_got_through():
+    """A third one comes round again, and passes."""
+    yaw = np.zeros((3, 1200))
+    yaw[0] = np.linspace(0, 3.0, 1200)
+    yaw[2, 100:300] = 3.0
+    ok = np.ones((3, 1200), bool)
+    ok[1, 600:] = False
+    position = np.zeros((3, 1200, 3))
+    position[2, 900:, 0] = 2.0
+    quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
+    outcome = trials.judge(TUBE, walk(3, quaternion=quaternion, ok=ok, position=position))
+    assert outcome.retreated.tolist() == [True, False, False]
+    assert outcome.passed.tolist() == [False, False, True]
+    assert outcome.touched.tolist() == [False, True, False]
+    assert outcome.frames.tolist() == [1200, 601, 901]
+
+
+def test_a_robot_that_stays_out_is_judged_at_the_end():
+    outcome = trials.judge(TUBE, walk(1, frames=300))
+    assert (outcome.frames.tolist(), outcome.touched.tolist(), outcome.retreated.tolist()) == ([300], [False], [False])

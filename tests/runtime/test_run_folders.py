@@ -1,0 +1,261 @@
+"""Stages run once, again when what they are made from changes, and never leave half a result."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lgmdjax
+from lgmdjax.errors import InputError
+from lgmdjax.runtime import storage
+from lgmdjax.runtime.run_folders import Run, Stage, execute, open_run
+
+
+@dataclass(frozen=True)
+class Number:
+    value: int
+    parts: tuple[int, ...] = (1, 2)
+
+
+@dataclass
+class Pipeline:
+    """Two numbers and their sum; writes down what ran."""
+
+    ran: list[str] = field(default_factory=list)
+    interrupt: bool = False
+
+    def number(self, folder: Path, inputs: Mapping[str, Path], settings: Number, seed: int) -> None:
+        self.ran.append(folder.name.partition(".")[0])
+        (folder / "value.txt").write_text(str(settings.value + seed))
+
+    def total(self, folder: Path, inputs: Mapping[str, Path], settings: Number, seed: int) -> None:
+        self.ran.append("total")
+        values = [int((inputs[name] / "value.txt").read_text()) for name in ("left", "right")]
+        first = folder / "first" / "half.txt"
+        if first.exists():
+            self.ran.append("carried on")
+        else:
+            first.parent.mkdir()
+            first.write_text(str(values[0]))
+            if self.interrupt:
+                raise KeyboardInterrupt
+        (folder / "value.txt").write_text(str(int(first.read_text()) + values[1]))
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        return (
+            Stage(name="left", work=self.number),
+            Stage(name="right", work=self.number),
+            Stage(name="total", work=self.total, inputs=("left", "right")),
+        )
+
+    def execute(self, run: Run, target: str = "total") -> list[str]:
+        self.ran.clear()
+        execute(run, self.stages, target)
+        return list(self.ran)
+
+
+SETTINGS = {"left": Number(1), "right": Number(10), "total": Number(0)}
+
+
+@pytest.fixture
+def pipeline() -> Pipeline:
+    return Pipeline()
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return open_run(tmp_path, "try", "smoke", 5, SETTINGS)
+
+
+def test_a_finished_run_has_nothing_to_do(pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert pipeline.execute(run) == ["left", "right", "total"]
+    assert (run.folder / "total" / "value.txt").read_text() == "21"
+    began = capsys.readouterr().out
+    assert all(word in began for word in ("total: starts on 2 x cpu", "seed 5", str(run.folder), "jax"))
+    assert pipeline.execute(run) == []
+    assert capsys.readouterr().out.count("up to date") == 3
+
+
+def test_one_stage_runs_alone(pipeline: Pipeline, run: Run) -> None:
+    assert pipeline.execute(run, "right") == ["right"]
+    assert not (run.folder / "left").exists()
+
+
+def test_a_changed_setting_runs_what_depends_on_it_and_no_more(pipeline: Pipeline, run: Run) -> None:
+    pipeline.execute(run)
+    changed = replace(run, settings=SETTINGS | {"left": Number(2)})
+    assert pipeline.execute(changed) == ["left", "total"]
+    assert (run.folder / "total" / "value.txt").read_text() == "22"
+
+
+def test_another_seed_runs_everything(pipeline: Pipeline, run: Run) -> None:
+    pipeline.execute(run)
+    assert pipeline.execute(replace(run, seed=6)) == ["left", "right", "total"]
+
+
+def test_another_version_of_a_stage_runs_it(pipeline: Pipeline, run: Run) -> None:
+    pipeline.execute(run)
+    execute(run, [replace(stage, version=2) for stage in pipeline.stages[:1]], "left")
+    assert pipeline.ran[-1] == "left"
+
+
+@pytest.mark.parametrize("damage", ["lost", "cut", "stamp"])
+def test_a_damaged_stage_is_done_again(pipeline: Pipeline, run: Run, damage: str) -> None:
+    pipeline.execute(run)
+    if damage == "stamp":
+        (run.folder / "right" / "done.json").write_text('{"fingerpr')
+    elif damage == "cut":
+        (run.folder / "right" / "value.txt").write_text("")
+    else:
+        (run.folder / "right" / "value.txt").unlink()
+    assert pipeline.execute(run) == ["right"]
+    assert (run.folder / "right" / "value.txt").read_text() == "15"
+
+
+def test_a_file_that_the_user_adds_is_no_damage(pipeline: Pipeline, run: Run) -> None:
+    pipeline.execute(run)
+    (run.folder / "total" / "my notes.txt").write_text("fine")
+    assert pipeline.execute(run) == []
+
+
+def test_an_interrupted_stage_leaves_nothing_and_carries_on(
+    pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pipeline.interrupt = True
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.execute(run)
+    assert not (run.folder / "total").exists()
+    capsys.readouterr()
+    assert pipeline.execute(run) == ["total", "carried on"]
+    assert "total: carries on" in capsys.readouterr().out
+    assert (run.folder / "total" / "value.txt").read_text() == "21"
+    assert sorted(p.name for p in run.folder.iterdir()) == [".lock", "left", "right", "run.json", "total"]
+
+
+def test_an_interrupted_try_with_other_inputs_is_not_carried_on(pipeline: Pipeline, run: Run) -> None:
+    pipeline.interrupt = True
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.execute(run)
+    pipeline.interrupt = False
+    assert pipeline.execute(replace(run, settings=SETTINGS | {"left": Number(2)})) == ["left", "total"]
+    assert (run.folder / "total" / "value.txt").read_text() == "22"
+    assert not list(run.folder.glob("*.partial-*"))
+
+
+def test_a_failed_redo_keeps_the_result_that_was_there(pipeline: Pipeline, run: Run) -> None:
+    pipeline.execute(run)
+    pipeline.interrupt = True
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.execute(replace(run, settings=SETTINGS | {"total": Number(9)}))
+    assert (run.folder / "total" / "value.txt").read_text() == "21"
+
+
+def test_a_kill_at_any_moment_can_be_carried_on_from(tmp_path: Path) -> None:
+    """Kill the process in the stage, and then once more between its last file and the move into place."""
+    script = textwrap.dedent("""
+        import os, signal, sys
+        from pathlib import Path
+        from lgmdjax import runs
+        def work(folder, inputs, settings, seed):
+            if not (folder / "a").exists():
+                (folder / "a").write_text("a")
+                os.kill(os.getpid(), signal.SIGKILL)
+            (folder / "b").write_text("b")
+        def die(*_):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if sys.argv[2] == "die":
+            move = os.replace
+            os.replace = lambda source, to: die() if str(to).endswith("stage") else move(source, to)
+        run = runs.open_run(Path(sys.argv[1]), "try", "smoke", 0, {"stage": 1})
+        print(runs.execute(run, [runs.Stage(name="stage", work=work)], "stage"))
+    """)
+    (tmp_path / "script.py").write_text(script)
+    stage = tmp_path / "try" / "stage"
+
+    def start(how: str) -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"PYTHONPATH": str(Path(lgmdjax.__file__).parent.parent)}
+        command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path), how]
+        return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+    assert start("live").returncode == -signal.SIGKILL
+    assert not stage.exists()
+    assert start("die").returncode == -signal.SIGKILL
+    assert not stage.exists()
+    finished = start("live")
+    assert finished.returncode == 0, finished.stderr
+    assert "starts" not in finished.stdout  # all files were there: only the move was missing
+    assert sorted(path.name for path in stage.iterdir()) == ["a", "b", "done.json"]
+
+
+def test_other_settings_are_refused(tmp_path: Path, run: Run) -> None:
+    for scale, seed, settings, named in [
+        ("quick", 5, SETTINGS, "scale = quick"),
+        ("smoke", 6, SETTINGS, "seed = 6"),
+        ("smoke", 5, SETTINGS | {"left": Number(3)}, "settings.left.value = 3"),
+    ]:
+        with pytest.raises(InputError, match=f"expected .*{named}, got .* made with .*; choose"):
+            open_run(tmp_path, "try", scale, seed, settings)
+    assert open_run(tmp_path, "try", "smoke", 5, SETTINGS) == run
+
+
+def test_the_settings_are_written_down(run: Run) -> None:
+    made = json.loads((run.folder / "run.json").read_text())
+    assert made["settings"]["left"] == {"value": 1, "parts": [1, 2]}
+    assert made["seed"] == 5 and made["scale"] == "smoke" and "jax" in made["versions"]
+
+
+@pytest.mark.parametrize("content", ["", '{"format": 1', "[]", '{"format": 1}'])
+def test_unreadable_settings_are_refused(tmp_path: Path, run: Run, content: str) -> None:
+    (run.folder / "run.json").write_text(content)
+    with pytest.raises(InputError, match=r"run\.json.*cannot be read"):
+        open_run(tmp_path, "try", "smoke", 5, SETTINGS)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", Path("/proc/nowhere")):
+        with pytest.raises(InputError, match="expected a folder that can be written, got"):
+            open_run(out, "try", "smoke", 0, SETTINGS)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "..", "/tmp"])
+def test_a_name_with_a_path_in_it_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="plain folder name"):
+        open_run(tmp_path, name, "smoke", 0, SETTINGS)
+
+
+def test_two_processes_do_not_share_a_run_folder(run: Run) -> None:
+    nested: list[str] = []
+
+    def work(folder: Path, inputs: Mapping[str, Path], settings: Number, seed: int) -> None:
+        with pytest.raises(InputError, match="a run at work in it") as caught:
+            execute(run, [Stage(name="right", work=work)], "right")
+        nested.append(str(caught.value))
+
+    execute(run, [Stage(name="left", work=work)], "left")
+    assert len(nested) == 1
+
+
+def test_damaged_files_of_a_stage_are_named(tmp_path: Path) -> None:
+    stage = tmp_path / "collect"
+    stage.mkdir()
+    (stage / "a.json").write_text('{"threshold": ')
+    np.savez(stage / "b.npz", gain=1.0)
+    assert storage.read_arrays(stage / "b.npz")["gain"] == 1.0
+    (stage / "b.npz").write_bytes((stage / "b.npz").read_bytes()[:-20])
+    for read, name, found in (
+        (storage.read_json, "a.json", "cannot be read"),
+        (storage.read_arrays, "b.npz", "cannot be read"),
+        (storage.read_json, "none.json", "none"),
+    ):
+        with pytest.raises(InputError, match=f"expected .*{name}.*{found}.*`lgmdjax collect`"):
+            read(stage / name)
