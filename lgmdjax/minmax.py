@@ -14,24 +14,24 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 
-def larger(a: ArrayLike, b: ArrayLike) -> Array:
+def maximum(a: ArrayLike, b: ArrayLike) -> Array:
     """max(a, b). Gradient: that of the larger one; of b where they are equal."""
     return _larger(*_alike(a, b))
 
 
-def smaller(a: ArrayLike, b: ArrayLike) -> Array:
+def minimum(a: ArrayLike, b: ArrayLike) -> Array:
     """min(a, b). Gradient: that of the smaller one; of b where they are equal."""
     return _smaller(*_alike(a, b))
 
 
-def least(a: ArrayLike, axis: int) -> Array:
+def amin(a: ArrayLike, axis: int) -> Array:
     """Take the least along an axis. Gradient: that of the first of the least, where `jnp.min` may come to 0/0."""
     return _least(axis, jnp.asarray(a))
 
 
-def within(x: Array, low: ArrayLike, high: ArrayLike) -> Array:
+def clip(x: Array, low: ArrayLike, high: ArrayLike) -> Array:
     """Limit x to low .. high. Gradient: 1 between them, else 0."""
-    return smaller(larger(x, low), high)
+    return minimum(maximum(x, low), high)
 
 
 def _alike(a: ArrayLike, b: ArrayLike) -> list[Array]:

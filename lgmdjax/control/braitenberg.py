@@ -35,7 +35,7 @@ from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
 from lgmdjax.locomotion.shaping import FASTEST, SLOWEST
-from lgmdjax.minmax import larger, smaller, within
+from lgmdjax.minmax import maximum, minimum, clip
 
 Scalar = Float[Array, ""] | float
 
@@ -108,7 +108,7 @@ def limit(params: Params, velocity: Float[Array, "2"]) -> Float[Array, "2"]:
     obstacle 0.3 m away on the left, this makes (2, -1), of (2.2, 0.8) it makes (2, 0.6).
     """
     most = params.fastest - params.slowest
-    return _drive(params, jnp.mean(velocity), within(velocity[1] - velocity[0], -most, most))
+    return _drive(params, jnp.mean(velocity), clip(velocity[1] - velocity[0], -most, most))
 
 
 def init(params: Params) -> State:
@@ -126,10 +126,10 @@ def step(params: Params, state: State, distances: Float[Array, "2"]) -> tuple[St
     nearness = _nearness(distances)
     velocity = respond(params, nearness)
     turn = velocity[1] - velocity[0]
-    danger = within((params.near - smaller(distances[0], distances[1])) / (params.near - params.close), 0.0, 1.0)
+    danger = clip((params.near - minimum(distances[0], distances[1])) / (params.near - params.close), 0.0, 1.0)
     tied = jnp.abs(nearness[1] - nearness[0]) < params.symmetry * jnp.sum(nearness)
     side = _side(params, state.side, turn, near=danger > 0, tied=tied)
-    strength = larger(side * turn, danger * params.full_turn)
+    strength = maximum(side * turn, danger * params.full_turn)
     mean = jnp.mean(velocity)
     limited = limit(params, mean + side * strength * jnp.asarray([-0.5, 0.5], velocity.dtype))
     return watch(params, limited), limited
@@ -164,13 +164,13 @@ def check(params: Params) -> None:
 
 
 def _nearness(distances: Float[Array, "2"]) -> Float[Array, "2"]:
-    return 1 / larger(distances, SHORTEST)
+    return 1 / maximum(distances, SHORTEST)
 
 
 def _drive(params: Params, mean: Float[Array, ""], turn: Float[Array, ""]) -> Float[Array, "2"]:
     """Make the velocity of a turn (v_right - v_left), its mean as near to the asked one as can be."""
     half = jnp.abs(turn) / 2
-    mean = within(mean, params.slowest + half, params.fastest - half)
+    mean = clip(mean, params.slowest + half, params.fastest - half)
     return jnp.stack([mean - turn / 2, mean + turn / 2])
 
 

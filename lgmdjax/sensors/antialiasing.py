@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lgmdjax.minmax import larger, smaller, within
+from lgmdjax.minmax import maximum, minimum, clip
 from lgmdjax.sensors.silhouettes import Pair
 from lgmdjax.world.texture import Vector
 
@@ -67,8 +67,8 @@ def slopes(s: Pair, pixels: Rays) -> Vector:
 def _slant(m_u: Array, m_v: Array) -> Slant:
     """Take p, q and k of an edge from the slopes of its margin."""
     m_u, m_v = jnp.abs(m_u), jnp.abs(m_v)
-    p = larger(m_u, m_v) + 1e-9
-    q = larger(smaller(m_u, m_v), 1e-3 * p)
+    p = maximum(m_u, m_v) + 1e-9
+    q = maximum(minimum(m_u, m_v), 1e-3 * p)
     both = once(1.0 / (p * q))  # one division for all
     return Slant(p, q * both, 0.5 * q * q * both, p * p * both)
 
@@ -78,15 +78,15 @@ def part(margin: Array, slant: Slant) -> Array:
 
     The other part, or where it is the larger this one, is a corner: a triangle of height x, cut at k.
     """
-    x = larger(0.5 + slant.half - jnp.abs(margin), 0.0)
-    cut = smaller(x, 2.0 * slant.half)
+    x = maximum(0.5 + slant.half - jnp.abs(margin), 0.0)
+    cut = minimum(x, 2.0 * slant.half)
     corner = slant.inverse * (x - 0.5 * cut) * cut
     return jnp.where(margin > 0, 1.0 - corner, corner)
 
 
 def ramp(margin: Array) -> Array:
     """`part` at half its price, for an edge whose margin is in units of its smear."""
-    return within(0.5 + margin, 0.0, 1.0)
+    return clip(0.5 + margin, 0.0, 1.0)
 
 
 def part_and_way(margin: Vector) -> tuple[Array, Pair]:
@@ -106,7 +106,7 @@ def rise(z: Array, slopes: Vector, pixels: Rays) -> tuple[Array, Pair]:
     m, m_u, m_v = _below(z, slopes, pixels)
     across, along = jnp.abs(m_u), jnp.abs(m_v)
     # Aslant an edge is smeared farther; of straight ramps this one is the nearest.
-    inverse = once(1.0 / (larger(across, along) + 0.2 * smaller(across, along) + 1e-9))
+    inverse = once(1.0 / (maximum(across, along) + 0.2 * minimum(across, along) + 1e-9))
     return m * inverse, (m_u * inverse, m_v * inverse)
 
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from lgmdjax.minmax import larger
+from lgmdjax.minmax import maximum
 from lgmdjax.sensors import antialiasing
 from lgmdjax.sensors.silhouettes import NEAR, Pair, Silhouette
 from lgmdjax.world import texture
@@ -179,7 +179,7 @@ def _prism(prism: Silhouette, pixels: antialiasing.Rays, keep: Keep) -> Layer:
     shift_u, shift_v = (
         by_lid_end * lid_shift[i] + by_other_end * other_shift[i] + by_side * pixels.rightward[i] for i in (0, 1)
     )
-    cover = larger(left + right - 1.0, 0.0) * larger(to_lid + to_other - 1.0, 0.0)
+    cover = maximum(left + right - 1.0, 0.0) * maximum(to_lid + to_other - 1.0, 0.0)
     on_lid = prism.lid * d[2]
     by_lid = on_lid < side[0] + jnp.where(lidless, -_OPEN, jnp.where(within, _OPEN, 0.0))
     s = (jnp.where(by_lid, 0.0, near[0]), jnp.where(by_lid, 0.0, near[1]), jnp.where(by_lid, prism.lid, 0.0))
@@ -225,7 +225,7 @@ def _round_sides(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[P
     p_x, p_y = o_x * power, o_y * power
     moment = o_x * y - o_y * x
     q_square = prism.radius_square * (x * x + y * y) - moment * moment
-    inverse = lax.rsqrt(larger(q_square, 0.2 * prism.limb * width + 1e-12))
+    inverse = lax.rsqrt(maximum(q_square, 0.2 * prism.limb * width + 1e-12))
     b = o_x * x + o_y * y
     e_x, e_y = (b * p_x - x) * inverse, (b * p_y - y) * inverse
     return (p_x + e_x, p_y + e_y), (p_x - e_x, p_y - e_y)
@@ -253,7 +253,7 @@ def _room(arena: Arena, eye: Array, pixels: antialiasing.Rays, keep: Keep) -> _R
     floor, floor_shift = antialiasing.part_below(-eye[2], slopes, pixels)
     below_top, top_shift = antialiasing.part_below(arena.wall_height - eye[2], slopes, pixels)
     sky = 1.0 - below_top
-    wall = larger(1.0 - floor - sky, 0.0)
+    wall = maximum(1.0 - floor - sky, 0.0)
 
     rows = texture.prepare(arena.wall_texture)
     x_row, y_row = (choose(pixels.d[i] > 0, _row(rows, 2 * i + 1), _row(rows, 2 * i)) for i in (0, 1))
@@ -274,9 +274,9 @@ def _room(arena: Arena, eye: Array, pixels: antialiasing.Rays, keep: Keep) -> _R
         return Layer(nearness, cover, (shift_u, shift_v), s, (-eye[0], -eye[1]), row)
 
     zero = jnp.zeros_like(part)
-    as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / larger(eye[2], NEAR)), floor_row)
+    as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / maximum(eye[2], NEAR)), floor_row)
     as_wall = layer(jnp.where(floor_first, 1.0, jnp.where(on_edge, wall, wall * part)), (*wall_s, zero), wall_row)
-    as_other = layer(wall * (1.0 - part) / larger(1.0 - wall * part, 1e-3), (*other_s, zero), other_row)
+    as_other = layer(wall * (1.0 - part) / maximum(1.0 - wall * part, 1e-3), (*other_s, zero), other_row)
     mean = floor * floor_row.brightness + wall * wall_row.brightness + sky * arena.sky
     beside = jnp.where(on_edge, floor_row.brightness, jnp.where(sky > 0, arena.sky, other_row.brightness))
     return _Room(
@@ -291,7 +291,7 @@ def _room(arena: Arena, eye: Array, pixels: antialiasing.Rays, keep: Keep) -> _R
 def _walls(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
     """Tell whether a wall in x is met before one in y, and s of both."""
     low, high = eye[:2] - arena.room[0::2], arena.room[1::2] - eye[:2]
-    forth, back = 1.0 / larger(high, NEAR), -1.0 / larger(low, NEAR)
+    forth, back = 1.0 / maximum(high, NEAR), -1.0 / maximum(low, NEAR)
     s_x, s_y = jnp.where(d[0] > 0, forth[0], back[0]), jnp.where(d[1] > 0, forth[1], back[1])
     zero = jnp.zeros_like(s_x)
     return s_x * d[0] > s_y * d[1], (s_x, zero), (zero, s_y)
@@ -305,7 +305,7 @@ def _part_of_nearer(wall: Pair, other: Pair, pixels: antialiasing.Rays) -> tuple
 def _shade(handedness: Array, eye: Array, pixels: antialiasing.Rays, layer: Layer, bands: int) -> Array:
     """Grey of a layer where the rays meet it, averaged over the pixel."""
     d, s = pixels.d, layer.s
-    t = antialiasing.once(1.0 / larger(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
+    t = antialiasing.once(1.0 / maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
     scaled = t * layer.texture.frequency
 
     def step(change: Vector) -> Vector:

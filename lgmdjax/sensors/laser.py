@@ -16,7 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
-from lgmdjax.minmax import least, smaller
+from lgmdjax.minmax import amin, minimum
 from lgmdjax.world import raycast
 from lgmdjax.world.arena import Arena
 
@@ -55,11 +55,11 @@ def scan(
     phi = bearings(params).astype(rotation.dtype)
     # Written out, because a float32 matrix product on a GPU may round to ten bits.
     directions = jnp.cos(phi)[:, None] * rotation[:, 0] + jnp.sin(phi)[:, None] * rotation[:, 1]
-    return smaller(raycast.distance(arena, position, directions), params.clip)
+    return minimum(raycast.distance(arena, position, directions), params.clip)
 
 
 def hemifields(ranges: Float[Array, "*batch rays"]) -> Float[Array, "*batch 2"]:
     """Find d_l and d_r [m], the nearest on either side (for eq. 22); the middle ray belongs to both."""
     middle = ranges.shape[-1] // 2
     right = ranges[..., : ranges.shape[-1] - middle]
-    return jnp.stack([least(ranges[..., middle:], axis=-1), least(right, axis=-1)], axis=-1)
+    return jnp.stack([amin(ranges[..., middle:], axis=-1), amin(right, axis=-1)], axis=-1)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from lgmdjax.minmax import larger, smaller
+from lgmdjax.minmax import maximum, minimum
 from lgmdjax.world import texture
 from lgmdjax.world.arena import Arena
 from lgmdjax.world.obstacles import Prisms, is_parked, turned
@@ -93,7 +93,7 @@ def may_show(
     radius = radii[..., None]
     x, y, z = (axes[..., i, None] for i in range(3))
     elevation = jnp.arcsin(jnp.clip(z, -1.0, 1.0))
-    slack = jnp.sin(smaller(radius, 0.5 * jnp.pi))
+    slack = jnp.sin(minimum(radius, 0.5 * jnp.pi))
     from_left = silhouettes.left[0] * x + silhouettes.left[1] * y > -slack
     from_right = silhouettes.right[0] * x + silhouettes.right[1] * y > -slack
     level = (elevation + radius > bounds.lowest) & (elevation - radius < bounds.highest)
@@ -125,7 +125,7 @@ def _of_boxes(boxes: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
     signs = jnp.asarray([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]], dtype=o.dtype)
     offsets = boxes.half_size[:, None, :] * signs
     corners = o[:, None, :] + offsets[..., :1] * x_axis[:, None] + offsets[..., 1:] * y_axis[:, None]
-    gap = larger(jnp.abs(local) - boxes.half_size, 0.0)
+    gap = maximum(jnp.abs(local) - boxes.half_size, 0.0)
     zero = jnp.zeros_like(boxes.yaw)
     return _silhouette(
         boxes,
@@ -144,10 +144,10 @@ def _of_boxes(boxes: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
 
 def _of_cylinders(cylinders: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
     o, radius = cylinders.centre - eye[:2], cylinders.half_size[:, 0]
-    distance = larger(_norm(o), NEAR)
+    distance = maximum(_norm(o), NEAR)
     within = distance < radius
     sine = jnp.where(within, 0.5, radius / jnp.where(within, 1.0, distance))
-    cosine = jnp.sqrt(larger(1.0 - sine * sine, 1e-8))
+    cosine = jnp.sqrt(maximum(1.0 - sine * sine, 1e-8))
     along = o / distance[:, None]
     aside = jnp.stack([-along[:, 1], along[:, 0]], axis=-1)
     along, aside = along * sine[:, None], aside * cosine[:, None]
@@ -157,7 +157,7 @@ def _of_cylinders(cylinders: Prisms, eye: Array) -> tuple[Silhouette, Bounds]:
         eye,
         within,
         (along - aside, along + aside),
-        (larger(distance - radius, 0.0), distance + radius),
+        (maximum(distance - radius, 0.0), distance + radius),
         axis=(zero, zero),
         ahead=(zero, zero),
         behind=(zero, zero),
@@ -172,7 +172,7 @@ def _silhouette(
 ) -> tuple[Silhouette, Bounds]:
     """Fill in what boxes and cylinders have in common."""
     # Nothing is seen under the floor, where padding is parked.
-    z_t, z_b = prisms.top - eye[2], larger(prisms.bottom, 0.0) - eye[2]
+    z_t, z_b = prisms.top - eye[2], maximum(prisms.bottom, 0.0) - eye[2]
     from_above, from_below = z_t < 0, z_b > 0
     lid_end, other_end = jnp.where(from_below, z_b, z_t), jnp.where(from_below, z_t, z_b)
     sides = jnp.where(within, 0.0, 1.0)[:, None]
@@ -187,7 +187,7 @@ def _silhouette(
         texture=texture.prepare(prisms.texture),
         **shape,
     )
-    nearest, farthest = larger(reach[0], NEAR), reach[1]
+    nearest, farthest = maximum(reach[0], NEAR), reach[1]
     highest = jnp.arctan2(z_t, jnp.where(from_above, farthest, nearest))
     lowest = jnp.arctan2(z_b, jnp.where(from_below, farthest, nearest))
     return silhouette, lax.stop_gradient(Bounds(nearest, lowest, highest, within))
@@ -198,7 +198,7 @@ def _outermost(o: Array, corners: Float[Array, "n 4 2"]) -> Pair:
     along = o[:, None, 0] * corners[..., 0] + o[:, None, 1] * corners[..., 1]
     aside = o[:, None, 0] * corners[..., 1] - o[:, None, 1] * corners[..., 0]
     angle = jnp.arctan2(*lax.stop_gradient((aside, along)))
-    unit = corners / larger(_norm(corners), NEAR)[..., None]
+    unit = corners / maximum(_norm(corners), NEAR)[..., None]
     left = jnp.take_along_axis(unit, jnp.argmax(angle, axis=1)[:, None, None], axis=1)[:, 0]
     right = jnp.take_along_axis(unit, jnp.argmin(angle, axis=1)[:, None, None], axis=1)[:, 0]
     return jnp.stack([left[:, 1], -left[:, 0]], axis=-1), jnp.stack([-right[:, 1], right[:, 0]], axis=-1)

@@ -19,7 +19,7 @@ beyond the walls.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgmdjax.minmax import larger, least, smaller
+from lgmdjax.minmax import maximum, amin, minimum
 from lgmdjax.world.arena import Arena
 from lgmdjax.world.obstacles import Prisms, turned
 
@@ -33,10 +33,10 @@ def distance(arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "
     Hard: no footprint, no blending. Gradient: that of the surface hit; zero where nothing is.
     """
     d = jnp.moveaxis(directions, -1, 0)
-    room = smaller(to_floor(origin, directions), to_walls(arena, origin, directions))
-    boxes = least(_to_boxes(arena.boxes, origin, d), axis=0)
-    cylinders = least(_to_cylinders(arena.cylinders, origin, d), axis=0)
-    return smaller(room, smaller(boxes, cylinders))
+    room = minimum(to_floor(origin, directions), to_walls(arena, origin, directions))
+    boxes = amin(_to_boxes(arena.boxes, origin, d), axis=0)
+    cylinders = amin(_to_cylinders(arena.cylinders, origin, d), axis=0)
+    return minimum(room, minimum(boxes, cylinders))
 
 
 def to_floor(origin: Float[Array, "3"], directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays"]:
@@ -52,9 +52,9 @@ def to_walls(arena: Arena, origin: Float[Array, "3"], directions: Float[Array, "
     x_min, x_max, y_min, y_max = arena.room
     x_in, x_out = _slab(origin[0], directions[..., 0], x_min, x_max)
     y_in, y_out = _slab(origin[1], directions[..., 1], y_min, y_max)
-    t_in, t_out = larger(x_in, y_in), smaller(x_out, y_out)
+    t_in, t_out = maximum(x_in, y_in), minimum(x_out, y_out)
     z = origin[2] + t_out * directions[..., 2]
-    hit = (t_out >= larger(t_in, 0.0)) & (z >= 0) & (z <= arena.wall_height)
+    hit = (t_out >= maximum(t_in, 0.0)) & (z >= 0) & (z <= arena.wall_height)
     return jnp.where(hit, t_out, jnp.inf)
 
 
@@ -83,7 +83,7 @@ def _to_boxes(boxes: Prisms, o: Array, d: Array) -> Array:
     x_in, x_out = _slab(x, cosine * d[0] + sine * d[1], -a, a)
     y_in, y_out = _slab(y, cosine * d[1] - sine * d[0], -b, b)
     z_in, z_out = _slab(o[2], d[2], low, high)
-    return _first(larger(larger(x_in, y_in), z_in), smaller(smaller(x_out, y_out), z_out))
+    return _first(maximum(maximum(x_in, y_in), z_in), minimum(minimum(x_out, y_out), z_out))
 
 
 def _to_cylinders(cylinders: Prisms, o: Array, d: Array) -> Array:
@@ -96,7 +96,7 @@ def _to_cylinders(cylinders: Prisms, o: Array, d: Array) -> Array:
     radius, low, high = _leading(jnp.stack([cylinders.half_size[:, 0], cylinders.bottom, cylinders.top]), d)
     square = jnp.sum(d[:2] * d[:2], axis=0)
     level = square > _TINY**2
-    square = larger(square, _TINY**2)
+    square = maximum(square, _TINY**2)
     c = x * d[1] - y * d[0]
     # A vertical ray is inside the disc for ever, or never.
     margin: Array = radius**2 - jnp.where(level, c * c / square, x * x + y * y)
@@ -105,7 +105,7 @@ def _to_cylinders(cylinders: Prisms, o: Array, d: Array) -> Array:
     along: Array = x * d[0] + y * d[1]
     middle = jnp.where(level, -along / square, 0.0)
     z_in, z_out = _slab(o[2], d[2], low, high)
-    t = _first(larger(middle - half, z_in), smaller(middle + half, z_out))
+    t = _first(maximum(middle - half, z_in), minimum(middle + half, z_out))
     return jnp.where(meets, t, jnp.inf)
 
 
@@ -138,8 +138,8 @@ def to_capsules(
     reached = jnp.isfinite(t)
     height = jnp.sum((o + jnp.where(reached, t, 0.0)[..., None] * d) * share, axis=-1)
     side = jnp.where(long & reached & (height >= 0) & (height <= 1), t, jnp.inf)
-    caps = smaller(_to_spheres(o, d, radii), _to_spheres(origin - ends, d, radii))
-    return smaller(side, caps)
+    caps = minimum(_to_spheres(o, d, radii), _to_spheres(origin - ends, d, radii))
+    return minimum(side, caps)
 
 
 def _to_spheres(o: Array, d: Array, radii: Array) -> Array:
@@ -159,7 +159,7 @@ def _slab(o: Array, d: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """Interval of t in which o + t d is between `low` and `high`, for each coordinate alone."""
     d = jnp.where(jnp.abs(d) < _TINY, _TINY, d)
     t_low, t_high = (low - o) / d, (high - o) / d
-    return smaller(t_low, t_high), larger(t_low, t_high)
+    return minimum(t_low, t_high), maximum(t_low, t_high)
 
 
 def _first(t_in: Array, t_out: Array) -> Array:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgmdjax.minmax import larger, smaller
+from lgmdjax.minmax import maximum, minimum
 
 WAVES = ((0.83, 0.61, 0.0), (0.0, 1.62, 1.47), (3.6, 0.0, 3.1), (0.0, -7.3, 5.9))
 """k_b in turns a coarsest wavelength. Each lies in a plane of two axes: a product less, and no face is left plain."""
@@ -48,7 +48,7 @@ class Texture(NamedTuple):
 def prepare(row: Float[Array, "*n 4"]) -> Texture:
     """Turn texture rows (brightness, contrast, phase, scale) into what `grey` takes."""
     brightness, contrast, phase, scale = (row[..., i] for i in range(4))
-    amplitude = smaller(contrast * brightness, 255.0 - brightness)
+    amplitude = minimum(contrast * brightness, 255.0 - brightness)
     return Texture(brightness, amplitude, phase * _TURN, 1.0 / scale)
 
 
@@ -75,7 +75,7 @@ def wave(turns: Array) -> Array:
 
 
 def _kept(across: Array, down: Array) -> Array:
-    left = larger(1.0 - 0.8224670334 * (across * across + down * down), 0.0)
+    left = maximum(1.0 - 0.8224670334 * (across * across + down * down), 0.0)
     return left * left
 
 
