@@ -13,6 +13,9 @@ import numpy as np
 
 from lgmdjax.errors import InputError
 
+JsonObject = dict[str, Any]
+"""What JSON calls an object: the rows of a study, the header of a file."""
+
 COMMANDS = ("fit-gait", "collect", "train", "evaluate", "report")  # that make a folder of their name
 
 
