@@ -1,11 +1,11 @@
-# make setup | reproduce | test | lint | clean      (PYTHON=... and VENV=... choose another interpreter, another place)
+# make setup | reproduce | test | test-default-xla | coverage | docs | lint | clean   (PYTHON=... and VENV=... choose another interpreter, another place)
 
 VENV ?= .venv
 SCALE ?= quick
 SEED ?= 0
 .DEFAULT_GOAL := setup
 .DELETE_ON_ERROR:
-.PHONY: setup reproduce test lint clean lock
+.PHONY: setup reproduce test test-default-xla coverage docs lint clean lock
 
 # The first interpreter that runs and is new enough; a name alone proves nothing (version managers leave shims).
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -32,6 +32,20 @@ reproduce: setup
 
 test: setup
 	'$(VENV)/bin/python' -m pytest $(ARGS)
+
+# The tests compile with other flags than users do, to save time; contracts, gradients, images and symmetry with both.
+test-default-xla: setup
+	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m default_xla $(ARGS)
+
+# Lines that the tests reach, as a table and in build/coverage; needs half again as long as `make test`.
+coverage: setup
+	'$(VENV)/bin/python' -m pytest --cov --cov-report=term --cov-report=html $(ARGS)
+
+# The pages, into build/docs; a warning or a link inside the site that leads nowhere is an error.
+docs: setup
+	rm -rf build/docs docs/generated
+	JAX_PLATFORMS=cpu '$(VENV)/bin/python' -m sphinx --quiet --fail-on-warning --keep-going -b html docs build/docs
+	'$(VENV)/bin/python' docs/check_links.py build/docs
 
 lint: setup
 	'$(VENV)/bin/ruff' check .

@@ -1,11 +1,17 @@
-"""How long a stereo pair takes and how much memory, beside what one would use instead, in turns within one run.
+"""Time and memory of a stereo pair, compared with what one would use instead.
 
     python benchmarks/camera.py
 
-A room with 24 obstacles and walls, textured, every pixel integrated over its area, in float32. Beside it C
-`mj_multiRay` on the same rays and the same things, which gives a distance a ray: hard, without texture, on one
-thread. And `mujoco.Renderer`, where there is OpenGL: a pinhole picture of the same size for each eye, since it has no
-fisheye. Wall time is what one waits; processor time is of all cores together, and hangs less on what else runs.
+The scene is a textured room with walls and 24 obstacles.
+
+| candidate         | what it computes                                                                           |
+| ----------------- | ------------------------------------------------------------------------------------------ |
+| `camera.render`   | both pictures in float32, each pixel integrated over its area                              |
+| C `mj_multiRay`   | the distance along one ray for each pixel, without texture or area, on one thread          |
+| `mujoco.Renderer` | a pinhole picture of the same size for each eye, since it has no fisheye; only with OpenGL |
+
+Candidates take turns within one run. Wall time is what a user waits; processor time is the sum over all cores, and
+depends less on other programs.
 """
 
 import math
@@ -32,32 +38,32 @@ POSITIONS = np.array([[0.1, 0.0325, 0.17], [0.1, -0.0325, 0.17]], np.float32)
 ROTATION = np.eye(3, dtype=np.float32)
 
 
-def room(obstacles: int = 24) -> arena.Arena:
-    """Stand boxes and cylinders on two rings about the eyes."""
-    around = np.arange(obstacles // 2) * 4 * math.pi / obstacles
-    ring = np.stack([np.cos(around), np.sin(around)], axis=-1)
-    turned = np.stack([np.cos(around + 0.2), np.sin(around + 0.2)], axis=-1)
-    boxes = arena.place(1.8 * ring, 0.15, 0.7, bottom=0.0)
-    cylinders = arena.place(2.6 * turned, 0.15, 1.0, bottom=0.0)
-    made = arena.empty_room((8.0, 8.0), boxes=boxes, cylinders=cylinders)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), made)
+def build_room(obstacles: int = 24) -> arena.Arena:
+    """Return a room with boxes and cylinders on two rings around the eyes."""
+    angles = np.arange(obstacles // 2) * 4 * math.pi / obstacles
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    rotated_ring = np.stack([np.cos(angles + 0.2), np.sin(angles + 0.2)], axis=-1)
+    boxes = arena.make_prisms(1.8 * ring, 0.15, 0.7, bottom=0.0)
+    cylinders = arena.make_prisms(2.6 * rotated_ring, 0.15, 1.0, bottom=0.0)
+    room = arena.empty_room((8.0, 8.0), boxes=boxes, cylinders=cylinders)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), room)
 
 
-def in_mujoco(made: arena.Arena) -> mujoco.MjModel:
-    """Build the same things of MuJoCo's geoms, and two eyes."""
+def build_mujoco_model(room: arena.Arena) -> mujoco.MjModel:
+    """Return a MuJoCo model with the same obstacles as geoms, and a camera for each eye."""
     spec = mujoco.MjSpec()
     spec.visual.global_.offwidth, spec.visual.global_.offheight = EYES.width, EYES.height
     world = spec.worldbody
     world.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[8, 8, 0.1])
-    x_low, x_high, y_low, y_high = (float(bound) for bound in made.room)
-    height = float(made.wall_height)
+    x_low, x_high, y_low, y_high = (float(bound) for bound in room.bounds)
+    height = float(room.wall_height)
     for x in (x_low - 0.05, x_high + 0.05):
         size = [0.05, (y_high - y_low) / 2, height / 2]
         world.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=[x, 0, height / 2])
     for y in (y_low - 0.05, y_high + 0.05):
         size = [(x_high - x_low) / 2, 0.05, height / 2]
         world.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=[0, y, height / 2])
-    for prisms, kind in ((made.boxes, mujoco.mjtGeom.mjGEOM_BOX), (made.cylinders, mujoco.mjtGeom.mjGEOM_CYLINDER)):
+    for prisms, kind in ((room.boxes, mujoco.mjtGeom.mjGEOM_BOX), (room.cylinders, mujoco.mjtGeom.mjGEOM_CYLINDER)):
         for centre, half, top, yaw in zip(prisms.centre, prisms.half_size, prisms.top, prisms.yaw, strict=True):
             half_height, turn = float(top) / 2, [math.cos(float(yaw) / 2), 0, 0, math.sin(float(yaw) / 2)]
             is_box = kind == mujoco.mjtGeom.mjGEOM_BOX
@@ -68,8 +74,8 @@ def in_mujoco(made: arena.Arena) -> mujoco.MjModel:
     return spec.compile()
 
 
-def rays() -> np.ndarray:
-    """Give the directions of all pixels of an eye that looks along x."""
+def ray_directions() -> np.ndarray:
+    """Return the directions of all pixels of an eye that looks along x."""
     down, right = np.mgrid[: EYES.height, : EYES.width] + 0.5
     right, down = right - EYES.width / 2, down - EYES.height / 2
     rho = np.hypot(right, down)
@@ -77,8 +83,9 @@ def rays() -> np.ndarray:
     return np.stack([np.cos(theta), -np.sin(theta) * right / rho, -np.sin(theta) * down / rho], axis=-1).reshape(-1, 3)
 
 
-def multi_ray(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], object]:
-    directions = rays()
+def mujoco_rays(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], object]:
+    """Return a function that casts the rays of both eyes with C MuJoCo."""
+    directions = ray_directions()
     count = len(directions)
     geoms, distances = np.zeros(count, np.int32), np.zeros(count)
 
@@ -89,21 +96,21 @@ def multi_ray(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], object
     return cast
 
 
-def opengl(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], object]:
-    """Raise whatever a machine without OpenGL raises."""
+def mujoco_renderer(model: mujoco.MjModel, data: mujoco.MjData) -> Callable[[], object]:
+    """Return a function that renders both eyes with OpenGL; without OpenGL this raises one of many exceptions."""
     renderer = mujoco.Renderer(model, EYES.height, EYES.width)
 
-    def draw() -> None:
+    def render() -> None:
         for eye in ("left", "right"):
             renderer.update_scene(data, camera=eye)
             renderer.render()
 
-    draw()
-    return draw
+    render()
+    return render
 
 
 def medians(candidates: dict[str, Callable[[], object]]) -> dict[str, tuple[float, float]]:
-    """Time candidates in turns; median milliseconds of wall and of processor time."""
+    """Time candidates in turns; return the median wall and processor times of each [ms]."""
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in candidates}
     for run in candidates.values():
         run()
@@ -115,56 +122,61 @@ def medians(candidates: dict[str, Callable[[], object]]) -> dict[str, tuple[floa
     return {name: (statistics.median(w for w, _ in t), statistics.median(c for _, c in t)) for name, t in times.items()}
 
 
-def compiled(eyes: camera.Params, made: arena.Arena, robots: int = 1) -> tuple[Callable[[], object], float]:
-    """Return the drawing of a pair by each robot, and megabytes a pair."""
+def compile_render(eyes: camera.Params, room: arena.Arena, robots: int = 1) -> tuple[Callable[[], object], float]:
+    """Return a function that renders a stereo pair for each robot, and the memory of a pair [MB]."""
     positions = jnp.broadcast_to(jnp.asarray(POSITIONS), (robots, 2, 3))
-    draw = jax.vmap(partial(camera.render, eyes), in_axes=(None, 0, None))
-    program = jax.jit(draw).lower(made, positions, ROTATION).compile()
-    spent = program.memory_analysis()
-    memory = (spent.temp_size_in_bytes + spent.output_size_in_bytes) / 1e6 / robots if spent else math.nan
-    return lambda: jax.block_until_ready(program(made, positions, ROTATION)), memory
+    render = jax.vmap(partial(camera.render, eyes), in_axes=(None, 0, None))
+    program = jax.jit(render).lower(room, positions, ROTATION).compile()
+    analysis = program.memory_analysis()
+    memory = (analysis.temp_size_in_bytes + analysis.output_size_in_bytes) / 1e6 / robots if analysis else math.nan
+    return lambda: jax.block_until_ready(program(room, positions, ROTATION)), memory
 
 
 def main() -> None:
-    """Print the comparison, and how time and memory grow."""
+    """Print the comparison of candidates, and the growth of time and memory."""
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco"))
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, load {load}; {versions}\n")
-    made = room()
-    model = in_mujoco(made)
+    room = build_room()
+    model = build_mujoco_model(room)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    ours, memory = compiled(EYES, made)
-    candidates = {"lgmdjax": ours, "mj_multiRay": multi_ray(model, data)}
+    render, memory = compile_render(EYES, room)
+    candidates = {"lgmdjax": render, "mj_multiRay": mujoco_rays(model, data)}
     try:
-        candidates["mujoco.Renderer"] = opengl(model, data)
+        candidates["mujoco.Renderer"] = mujoco_renderer(model, data)
     except Exception as error:
         print(f"mujoco.Renderer: skipped, no OpenGL here ({type(error).__name__})\n")
-    crowding = int(camera.crowding(EYES, made, POSITIONS, ROTATION))
-    print(f"A pair of {EYES.width} x {EYES.height}: {memory:.1f} MB, {crowding} prisms in the fullest tile")
-    print("| a stereo pair   | wall [ms] | processor [ms] | of ours, wall |")
-    print("| --------------- | --------- | -------------- | ------------- |")
+    occupancy = int(camera.max_tile_occupancy(EYES, room, POSITIONS, ROTATION))
+    print(f"A pair of {EYES.width} x {EYES.height}: {memory:.1f} MB, at most {occupancy} obstacles in a tile")
+    print("| a stereo pair   | wall [ms] | processor [ms] | wall, ratio |")
+    print("| --------------- | --------- | -------------- | ----------- |")
     times = medians(candidates)
     for name, (wall, processor) in times.items():
-        print(f"| {name:15s} | {wall:9.2f} | {processor:14.2f} | {wall / times['lgmdjax'][0]:13.2f} |")
-    print("\n| pixels    | robots | obstacles | slots | wall [ms a pair] | memory [MB a pair] |")
-    print("| --------- | ------ | --------- | ----- | ---------------- | ------------------ |")
+        print(f"| {name:15s} | {wall:9.2f} | {processor:14.2f} | {wall / times['lgmdjax'][0]:11.2f} |")
+    print_growth()
+
+
+def print_growth() -> None:
+    """Print time and memory against the size of a picture and the number of robots and obstacles."""
+    print("\n| pixels    | robots | obstacles | tile capacity | wall [ms a pair] | memory [MB a pair] |")
+    print("| --------- | ------ | --------- | ------------- | ---------------- | ------------------ |")
     small = replace(EYES, width=80, height=60)
     for eyes, robots, obstacles in (
         (small, 1, 24),
         (small, 16, 24),
         (small, 64, 24),
         (small, 16, 8),
-        (replace(small, slots=3), 16, 24),
+        (replace(small, tile_capacity=3), 16, 24),
         (replace(EYES, width=160, height=120), 1, 24),
         (EYES, 1, 24),
         (EYES, 4, 24),
     ):
-        draw, memory = compiled(eyes, room(obstacles), robots)
-        wall = medians({"ours": draw})["ours"][0] / robots
+        render, memory = compile_render(eyes, build_room(obstacles), robots)
+        wall = medians({"lgmdjax": render})["lgmdjax"][0] / robots
         size = f"{eyes.width} x {eyes.height}"
         print(
-            f"| {size:9s} | {robots:6d} | {obstacles:9d} | {eyes.slots:5d} | {wall:16.3f} | {memory:18.2f} |",
+            f"| {size:9s} | {robots:6d} | {obstacles:9d} | {eyes.tile_capacity:13d} | {wall:16.3f} | {memory:18.2f} |",
             flush=True,
         )
 

@@ -1,10 +1,10 @@
-"""The whole frame: sense, decide, six physics substeps, for a crowd of robots in rooms of their own.
-
-Robot-frames a second of the compiled walk at two resolutions, its memory a robot, and how both grow with the crowd;
-beside it, in the same run, what one would write without this library: a loop over robots of C MuJoCo steps, C
-`mj_multiRay` for the distances behind every pixel of both eyes (no texture, no area), and no detector at all.
+"""Time and memory of a whole frame (observe, decide, six physics substeps) for a batch of robots in rooms of their own.
 
     python benchmarks/frame.py [--robots 1 16]
+
+Printed for two resolutions and several batch sizes: robot-frames a second of the compiled rollout, and its memory for
+each robot. In the same run they are compared with what one would write without this package: a loop of C MuJoCo steps
+and C `mj_multiRay` for the distances behind every pixel of both eyes, without texture, area or detector.
 """
 
 import argparse
@@ -25,35 +25,36 @@ from lgmdjax.control import braitenberg, policies
 from lgmdjax.sensors import camera
 from lgmdjax.simulation import closed_loop, rollout, room_batches, sharding
 
-RESOLUTIONS = ((320, 240, 60.0), (160, 120, 240.0))  # pixels, and the robot-frames a second asked for
-FRAMES = 10  # of a measured chunk
+RESOLUTIONS = ((320, 240, 60.0), (160, 120, 240.0))  # width, height [px], target [robot-frames/s]
+FRAMES = 10  # of a measured rollout
 REPEATS = 5
 
 
-def robot(width: int, height: int) -> closed_loop.Params:
-    """Put a robot together that its teacher drives and whose eyes draw the whole picture."""
-    return closed_loop.assemble(braitenberg.Params(), eyes=camera.Params(width=width, height=height))
+def assemble_robot(width: int, height: int) -> closed_loop.Params:
+    """Return a robot with the teacher as its policy, whose camera renders the whole picture."""
+    return closed_loop.assemble(braitenberg.Params(), camera_params=camera.Params(width=width, height=height))
 
 
 def measure(params: closed_loop.Params, robots: int) -> tuple[float, float]:
-    """Return robot-frames a second (median) and megabytes of temporaries a robot."""
+    """Return robot-frames a second (median), and temporary memory for each robot [MB]."""
     model, rooms = hexapod.build(), room_batches.random_rooms(jax.random.key(0), robots, 0.25)
-    states = rollout.start(params, model, rooms, driver=policies.TEACHER)
-    fixed = {"driver": policies.TEACHER, "frames": FRAMES}
-    compiled = rollout.advance.lower(params, model, rooms, states, draw=jnp.asarray(True), **fixed).compile()
+    states = rollout.reset_batch(params, model, rooms, policy=policies.TEACHER)
+    fixed = {"policy": policies.TEACHER, "frames": FRAMES}
+    compiled = rollout.rollout_batch.lower(params, model, rooms, states, render=jnp.asarray(True), **fixed).compile()
     analysis = compiled.memory_analysis()
-    share = robots / sharding.shares(robots)
-    memory = analysis.temp_size_in_bytes / 1e6 / share if analysis else math.nan  # not every device tells
+    robots_per_device = robots / sharding.device_count(robots)
+    # Not every device reports its memory.
+    memory = analysis.temp_size_in_bytes / 1e6 / robots_per_device if analysis else math.nan
     seconds = []
-    for _ in range(REPEATS + 1):  # the first is thrown away
+    for _ in range(REPEATS + 1):  # the first is left out
         began = time.perf_counter()
-        states, _ = jax.block_until_ready(compiled(params, model, rooms, states, draw=jnp.asarray(True)))
+        states, _ = jax.block_until_ready(compiled(params, model, rooms, states, render=jnp.asarray(True)))
         seconds.append(time.perf_counter() - began)
     return robots * FRAMES / statistics.median(seconds[1:]), memory
 
 
-def by_hand(width: int, height: int) -> float:
-    """Return frames a second of one robot in a plain loop: C MuJoCo steps, and rays without shading."""
+def measure_mujoco_loop(width: int, height: int) -> float:
+    """Return frames a second of one robot in a loop of C MuJoCo steps and rays without shading."""
     model = hexapod.load()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stance").id)
@@ -76,21 +77,21 @@ def by_hand(width: int, height: int) -> float:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print a line for each resolution and batch size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=[1, 16])
     robots = parser.parse_args().robots
-    jax.config.update("jax_num_cpu_devices", os.cpu_count())  # crowds on all cores, as from the command line
+    jax.config.update("jax_num_cpu_devices", os.cpu_count())  # batches use all cores, as in the command line
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "mujoco"))
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores; {versions}")
-    print("pixels      robots  robot-frames/s  asked  MB a robot  by hand, 1 robot  ratio")
-    for width, height, asked in RESOLUTIONS:
-        reference = by_hand(width, height)
+    print("pixels      robots  robot-frames/s  target  MB a robot  loop, 1 robot  ratio")
+    for width, height, target in RESOLUTIONS:
+        reference = measure_mujoco_loop(width, height)
         for count in robots:
-            rate, memory = measure(robot(width, height), count)
+            rate, memory = measure(assemble_robot(width, height), count)
             print(
-                f"{width} x {height}  {count:6d}  {rate:14.1f}  {asked:5.0f}  {memory:10.1f}  "
-                f"{reference:16.1f}  {rate / reference:5.2f}",
+                f"{width} x {height}  {count:6d}  {rate:14.1f}  {target:6.0f}  {memory:10.1f}  "
+                f"{reference:13.1f}  {rate / reference:5.2f}",
                 flush=True,
             )
 

@@ -1,11 +1,15 @@
-"""How long a pair of LGMDs takes for a stereo frame, beside the same equations in OpenCV, on one core.
+"""Time of a pair of LGMDs for a stereo frame, compared with the same equations in OpenCV, on one core.
 
     python benchmarks/lgmd.py
 
-Both are shown the same film, in turns within one run, and timed by the processor time of the process, which on one
-core is what passes on an idle machine; so neither figure nor ratio hangs on what else runs. JAX runs two ways: a
-frame a call, as on a robot, and a film in one program (`lax.scan`, as in a walk), where slicing the film counts
-too. OpenCV's subtract, filter2D, absdiff, scaleAdd and threshold are what one would write without JAX.
+| candidate | what it does                                                                                |
+| --------- | ------------------------------------------------------------------------------------------- |
+| calls     | one call for each frame, as on a robot                                                      |
+| scan      | all frames in one program (`lax.scan`, as in a rollout), with the slicing of the frames     |
+| OpenCV    | subtract, filter2D, absdiff, scaleAdd and threshold, as one would write without JAX         |
+
+All see the same frames, in turns within one run. Timed is the processor time of the process, which on one core equals
+the wall time of an idle machine; so neither times nor ratios depend on other programs.
 """
 
 import os
@@ -32,61 +36,61 @@ PARAMS = lgmd.Params()
 KERNEL = np.array(lgmd.KERNEL, np.float32)
 
 
-def film(width: int, height: int) -> np.ndarray:
-    """Draw a textured panorama that drifts by a fraction of a pixel a frame, in stereo."""
+def make_frames(width: int, height: int) -> np.ndarray:
+    """Return stereo frames of a textured panorama that drifts by a fraction of a pixel each frame."""
     rng = np.random.default_rng(0)
     panorama = cv2.GaussianBlur(rng.uniform(0, 255, (height, width + 64)).astype(np.float32), (0, 0), 2.0)
     panorama = 127 + 6 * (panorama - panorama.mean())
-    moved = [
+    shifted = [
         cv2.warpAffine(panorama, np.array([[1, 0, -0.7 * f], [0, 1, 0]]), (width + 64, height))
         for f in range(FRAMES + 1)
     ]
-    return np.stack([[m[:, 8 : 8 + width], m[:, 20 : 20 + width]] for m in moved]).astype(np.float32)
+    return np.stack([[s[:, 8 : 8 + width], s[:, 20 : 20 + width]] for s in shifted]).astype(np.float32)
 
 
-def in_opencv(frames: np.ndarray) -> list[tuple[float, float]]:
-    """Run eqs. 7-16 with OpenCV; u of both eyes a frame."""
-    last, before = list(frames[0]), [np.zeros_like(frames[0, 0])] * 2
+def run_opencv(frames: np.ndarray) -> list[tuple[float, float]]:
+    """Run eqs. 7-16 with OpenCV; return u of both eyes for each frame."""
+    last, previous = list(frames[0]), [np.zeros_like(frames[0, 0])] * 2
     responses = []
     for frame in frames[1:]:
         u = [0.0, 0.0]
         for eye in (0, 1):
-            L, P_before = np.ascontiguousarray(frame[eye]), before[eye]
+            L, P_before = np.ascontiguousarray(frame[eye]), previous[eye]
             P, E = cv2.subtract(L, last[eye]), cv2.absdiff(L, last[eye])
             I = np.abs(cv2.filter2D(P_before, cv2.CV_32F, KERNEL, borderType=cv2.BORDER_CONSTANT))  # noqa: E741
             S = cv2.scaleAdd(I, -0.4, E)
             _, passed = cv2.threshold(S, float(PARAMS.threshold), 0, cv2.THRESH_TOZERO)
             U, FF = cv2.sumElems(passed)[0] / L.size, cv2.norm(P_before, cv2.NORM_L1) / L.size
             u[eye] = 0.5 if float(PARAMS.suppression) < FF else 1 / (1 + np.exp(-U))
-            last[eye], before[eye] = L, P
+            last[eye], previous[eye] = L, P
         responses.append((u[0], u[1]))
     return responses
 
 
-both = jax.vmap(partial(lgmd.step, PARAMS))
+step_both_eyes = jax.vmap(partial(lgmd.step, PARAMS))
 
 
 @jax.jit
-def in_one_program(state: lgmd.State, frames: jax.Array) -> jax.Array:
-    """Run a film through both eyes."""
-    return jax.lax.scan(both, state, frames)[1].u
+def run_scan(state: lgmd.State, frames: jax.Array) -> jax.Array:
+    """Run both detectors over all frames in one program; return u."""
+    return jax.lax.scan(step_both_eyes, state, frames)[1].u
 
 
-# Without donating the state: XLA then copies the frame into it, which costs more than new memory.
-one_frame = jax.jit(both)
+# The state is not donated: XLA would copy the frame into it, which takes longer than new memory.
+step_compiled = jax.jit(step_both_eyes)
 
 
-def in_calls(state: lgmd.State, frames: list[jax.Array]) -> list[jax.Array]:
-    """Run a film with a call a frame, waiting for each."""
+def run_calls(state: lgmd.State, frames: list[jax.Array]) -> list[jax.Array]:
+    """Run both detectors with one call for each frame, waiting for each; return u."""
     responses = []
     for frame in frames:
-        state, response = one_frame(state, frame)
+        state, response = step_compiled(state, frame)
         responses.append(jax.block_until_ready(response.u))
     return responses
 
 
 def medians(candidates: Mapping[str, Callable[[], object]]) -> dict[str, float]:
-    """Time candidates in turns; median milliseconds a stereo frame."""
+    """Time candidates in turns; return the median time of a stereo frame [ms]."""
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for run in candidates.values():
         run()
@@ -98,31 +102,33 @@ def medians(candidates: Mapping[str, Callable[[], object]]) -> dict[str, float]:
     return {name: statistics.median(t) for name, t in times.items()}
 
 
-def opened(first: np.ndarray) -> lgmd.State:
+def init_both_eyes(first: np.ndarray) -> lgmd.State:
+    """Return the detectors' states at the first frame."""
     return jax.vmap(partial(lgmd.init, PARAMS))(jnp.asarray(first))
 
 
 def main() -> None:
+    """Print a table of times and memory against the size of a picture."""
     cv2.setNumThreads(1)
     print(f"A stereo frame through two LGMDs on one core, median of {ROUNDS} rounds in turns.")
-    print("Memory: the state and what a frame needs on the way; it grows with pixels and eyes, and nothing else.\n")
+    print("Memory: the state and the temporary arrays of a frame; proportional to the number of pixels and eyes.\n")
     print("| size        | calls [ms] | scan [ms] | OpenCV [ms] | OpenCV/calls | OpenCV/scan | memory [MB] |")
     print("| ----------- | ---------- | --------- | ----------- | ------------ | ----------- | ----------- |")
     for width, height in SIZES:
-        frames = film(width, height)
+        frames = make_frames(width, height)
         on_device, one_by_one = jnp.asarray(frames[1:]), [jnp.asarray(f) for f in frames[1:]]
-        state = opened(frames[0])
-        program = in_one_program.lower(state, on_device).compile()
-        spent = one_frame.lower(state, on_device[0]).compile().memory_analysis()
-        np.testing.assert_allclose(program(state, on_device), in_opencv(frames), atol=1e-4)
+        state = init_both_eyes(frames[0])
+        program = run_scan.lower(state, on_device).compile()
+        analysis = step_compiled.lower(state, on_device[0]).compile().memory_analysis()
+        np.testing.assert_allclose(program(state, on_device), run_opencv(frames), atol=1e-4)
         ms = medians(
             {
                 "scan": lambda p=program, s=state, f=on_device: jax.block_until_ready(p(s, f)),
-                "calls": lambda s=state, f=one_by_one: in_calls(s, f),
-                "opencv": lambda f=frames: in_opencv(f),
+                "calls": lambda s=state, f=one_by_one: run_calls(s, f),
+                "opencv": lambda f=frames: run_opencv(f),
             }
         )
-        memory = (spent.temp_size_in_bytes + spent.output_size_in_bytes) / 1e6 if spent else float("nan")
+        memory = (analysis.temp_size_in_bytes + analysis.output_size_in_bytes) / 1e6 if analysis else float("nan")
         print(
             f"| {width:4d} x {height:3d}  | {ms['calls']:10.3f} | {ms['scan']:9.3f} | {ms['opencv']:11.3f} "
             f"| {ms['opencv'] / ms['calls']:12.2f} | {ms['opencv'] / ms['scan']:11.2f} | {memory:11.2f} |"

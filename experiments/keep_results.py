@@ -1,7 +1,7 @@
-"""Keep what came of a run, without its walks: `python experiments/keep_results.py runs/paper-2026 experiments/results`.
+"""Copy a run without its walks: `python experiments/keep_results.py runs/paper-2026 experiments/results`.
 
-Walks and checkpoints are hundreds of megabytes, tables and figures two or three. What is kept is a run folder still,
-and goes on with the stages that are missing, as far as those do not ask for walks; the report's page asks for some.
+Walks and checkpoints take hundreds of megabytes, tables and figures two or three. The copy is a run folder: commands
+resume in it with the stages that are missing, except those that read recorded walks, the report among them.
 """
 
 import json
@@ -11,39 +11,41 @@ from pathlib import Path
 
 import tyro
 
-from lgmdjax.cli.main import guarded
+from lgmdjax.cli.main import exit_code
 from lgmdjax.errors import InputError
 from lgmdjax.runtime.storage import read_json, write_json
 
 WALKS = ("*.parquet", "walk.npz", "trajectories.npz", "walks", "episodes")
-DRAWN = ("*.svg", "*.png", "*.npz")
-LEFT_OUT = (*WALKS, "checkpoints", "pupils", "start-*", ".lock", "*.partial*", "report")  # fits and walks of a start
+FITS = ("checkpoints", "learners", "pupils", "repeat-*", "start-*", "tube-*")  # with the walks that belong to them
+OTHER = (".lock", "*.partial*", "report")
+FIGURES = ("*.svg", "*.png", "*.npz")
 
 
-def main(run: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], drawn: bool = True) -> None:
-    """Copy a run folder, and let the stamps of its stages tell of the files that are kept.
+def main(run: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], figures: bool = True) -> None:
+    """Copy a run folder without its walks, and list in the record of each stage the files that are kept.
 
     Args:
         run: the run folder
-        out: where a folder of the same name is made, or made anew
-        drawn: keep figures, and what the report draws others from; else tables and trained networks alone
+        out: the folder that gets a folder of the same name, in place of one that is there
+        figures: keep figures and the arrays that the report plots; without, only tables and trained networks
     """
     read_json(run / "run.json")
-    kept = out / run.name
-    if kept.resolve() == run.resolve():
-        raise InputError(f"expected another place than that of the run, got {out}; choose another folder")
-    shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(run, kept, ignore=shutil.ignore_patterns(*LEFT_OUT, *(() if drawn else DRAWN)))
-    for stamp in kept.glob("*/done.json"):
-        told = json.loads(stamp.read_text())
-        files = {name: size for name, size in told["files"].items() if (stamp.parent / name).is_file()}
-        write_json(stamp, told | {"files": files})
-    for folder in sorted(kept.rglob("*"), reverse=True):
+    copy = out / run.name
+    if copy.resolve() == run.resolve():
+        raise InputError(f"expected another folder than that of the run, got {out}; choose another")
+    shutil.rmtree(copy, ignore_errors=True)
+    ignored = (*WALKS, *FITS, *OTHER, *(() if figures else FIGURES))
+    shutil.copytree(run, copy, ignore=shutil.ignore_patterns(*ignored))
+    for record in copy.glob("*/done.json"):
+        facts = json.loads(record.read_text(encoding="utf-8"))
+        files = {name: size for name, size in facts["files"].items() if (record.parent / name).is_file()}
+        write_json(record, facts | {"files": files})
+    for folder in sorted(copy.rglob("*"), reverse=True):
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
-    size = sum(path.stat().st_size for path in kept.rglob("*") if path.is_file())
-    print(f"{kept}: {size / 1e6:.1f} MB")
+    size = sum(path.stat().st_size for path in copy.rglob("*") if path.is_file())
+    print(f"{copy}: {size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(lambda: tyro.cli(main)))
+    sys.exit(exit_code(lambda: tyro.cli(main)))

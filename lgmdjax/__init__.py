@@ -1,7 +1,26 @@
-"""Walking hexapod with insect eyes: LGMD collision detectors, a central pattern generator, a learned navigator.
+"""A hexapod robot that avoids obstacles with two looming detectors, differentiable end to end in JAX.
 
-The parts are plain modules, each importable and usable alone (`lgmdjax.detectors.lgmd`, `lgmdjax.locomotion.cpg`,
-...); nothing heavy is imported here, so that `import lgmdjax` and `lgmdjax --help` answer at once.
+`import lgmdjax as lj` gives the names below. Each is imported when it is first used, so that the import itself and
+`lgmdjax --help` take no time.
+
+| name | what |
+| --- | --- |
+| load_robot, random_rooms, rollout, run_trial | a robot, rooms, and walks of the one in the others |
+| score, plot_walks, write_video | what came of the walks: numbers, a figure, a video |
+| Record, Room, InputError | the types that they pass and the error that they raise |
+| lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
+| world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
+| simulation, reporting, evaluation, learning, studies, pipeline, cli, runtime | what is done with them |
+
+>>> import jax
+>>> import lgmdjax as lj
+>>> rooms = lj.random_rooms(jax.random.key(0), 4)
+>>> rooms.starts.shape  # x, y and yaw of 32 poses in each of 4 rooms
+(4, 32, 3)
 """
 
-__version__ = "0.1.0"
+import lazy_loader
+
+__version__ = "0.2.0"
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,5 +1,5 @@
-"""The one exception for what a user can get wrong, so that the command line ends in a line and not in a traceback."""
+"""The exception for invalid input, which the command line prints as one line without a traceback."""
 
 
 class InputError(ValueError):
-    """Bad input at the boundary: one line that says what was expected, what came, and what to do."""
+    """Invalid input from the user; the message is one line: what was expected, what was given, and what to do."""

@@ -1,15 +1,16 @@
-"""Where the package's own files are: the one module that knows, so that all others can be moved."""
+"""Paths of the package's own files; no other module derives a path from its own location."""
 
 from pathlib import Path
 
-PACKAGE = Path(__file__).resolve().parent
-"""The root of the package; its bytes are what kept programs are known by."""
+PACKAGE_DIR = Path(__file__).resolve().parent
+"""The root of the package. The hash of its files identifies cached programs."""
 
-SHAPING = PACKAGE / "data" / "shaping.safetensors"
-"""The default shaping networks (`experiments/fit_default_gait.py`)."""
+SHAPING_FILE = PACKAGE_DIR / "data" / "shaping.safetensors"
+"""Weights of the default shaping networks (`experiments/fit_default_gait.py`)."""
 
-PRETRAINED = PACKAGE / "data" / "trained"
-"""Gait and controller of the pretrained robot, from one run: each was learned with the other."""
+PRETRAINED_DIR = PACKAGE_DIR / "data" / "trained"
+"""Gait and controller of the pretrained robot. Both come from one run, in which the controller was trained with this
+gait."""
 
-MJCF = (PACKAGE / "mjcf", PACKAGE.parent / "mjcf")
-"""Folders that may hold the robot's XML: in an installed wheel, and in a checkout."""
+MJCF_DIRS = (PACKAGE_DIR / "mjcf", PACKAGE_DIR.parent / "mjcf")
+"""Folders that may contain the robot's XML: the first in an installed wheel, the second in a checkout."""

@@ -1,19 +1,27 @@
-"""What every test runs under: float64, checked shapes, a compilation cache that outlives the run."""
+"""Settings of all tests: double precision, checked shapes, a compilation cache that outlives the run.
+
+Set LGMDJAX_TEST_DEFAULT_XLA=1 to compile with XLA's default flags, as users do; `make test-default-xla` runs the tests
+that are marked `default_xla` so.
+"""
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
-# Before JAX is imported anywhere, and as a variable: subprocesses of a test must find the same cache.
+# As variables, and before JAX is imported anywhere: processes that a test starts must find the same cache.
 ROOT = Path(__file__).parent.parent
 CACHE = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that crowds are dealt out
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that robots are sharded
 os.environ.setdefault("MPLBACKEND", "Agg")
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA calls its own tuning flags errors
-# Most of the tests' time is compilation, of which XLA's older code generator needs a third less. What it makes is
-# slower where much is drawn, but little is drawn here.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs its own tuning flags as errors
+DEFAULT_XLA = os.environ.get("LGMDJAX_TEST_DEFAULT_XLA") == "1"
+if not DEFAULT_XLA:
+    # Most of the tests' time is compilation, which takes a third less with XLA's older code generator. Its programs
+    # render images more slowly, but tests render few.
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+# Tests that also run with the default flags: these files, and all tests of mirror symmetry.
+DEFAULT_XLA_FILES = ("test_contract.py", "test_gradients.py", "test_rollout_gradient.py", "test_camera.py")
 
 import jax
 import jaxtyping
@@ -29,20 +37,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Put the check of shapes in place before any test imports the package."""
+    """Install the check of shapes before any test imports the package."""
     if not config.getoption("--no-shapes"):
         jaxtyping.install_import_hook("lgmdjax", "shapecheck.check")
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the files that have slow tests, so that no worker is left alone with one at the end."""
+    """Mark tests for XLA's default flags; run files with slow tests first, so that none is left at the end."""
+    for item in items:
+        if item.path.name in DEFAULT_XLA_FILES or "mirror" in item.name:
+            item.add_marker("default_xla")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
 
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Let arguments of a wrong type through to the package, which refuses them in its own words."""
+    """Turn the check of shapes and types off, so that the package's own checks see wrong arguments."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,4 +1,4 @@
-"""Made-up walks, and a run folder as the stages leave it, with plausible numbers."""
+"""Synthetic walks, and a synthetic run folder as the stages write it, with plausible numbers."""
 
 import json
 from dataclasses import asdict
@@ -6,21 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
+from lgmdjax.control.names import POLICY_NAMES
 from lgmdjax.evaluation import metrics
-from lgmdjax.evaluation.collision_causes import KINDS
+from lgmdjax.evaluation.collision_causes import CAUSES
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
 from lgmdjax.world import arena
 
-DRIVERS = ("teacher", "learned", "blind", "direct", "random")
-RATES = {"teacher": 0.4, "learned": 3.21, "blind": 17.3, "direct": 12.9, "random": 19.8}
-PERIOD = 1.0
+COLLISIONS_PER_100_M = {"teacher": 0.4, "learned": 3.21, "blind": 17.3, "direct": 12.9, "random": 19.8}
+CYCLE_TIME = 1.0  # s
 
 
 def room() -> arena.Arena:
-    """A small room with three boxes, one of them hanging overhead, and two cylinders."""
+    """A small room with three boxes, one of them overhead, and two cylinders."""
     return arena.empty_room(
         (8.0, 8.0),
-        boxes=arena.place(
+        boxes=arena.make_prisms(
             [[2.0, 1.0], [-1.5, -2.0], [0.5, -1.5]],
             [[0.3, 0.5], [0.4, 0.4], [0.8, 0.3]],
             [0.8, 0.6, 0.9],
@@ -28,7 +28,7 @@ def room() -> arena.Arena:
             bottom=[0.0, 0.0, 0.7],
             texture=[[150.0, 0.7, 0.3, 0.4], [90.0, 0.6, 1.0, 0.5], [120.0, 0.5, 2.0, 0.6]],
         ),
-        cylinders=arena.place(
+        cylinders=arena.make_prisms(
             [[-2.0, 1.5], [1.0, -2.8]], [[0.2, 0.2], [0.15, 0.15]], [1.0, 1.4], texture=(60.0, 0.8, 0.5, 0.3)
         ),
         start=(0.0, 2.5, 0.0),
@@ -36,7 +36,7 @@ def room() -> arena.Arena:
 
 
 def walk(robots: int = 2, frames: int = 1200, **changes: np.ndarray) -> Record:
-    """Robots that walk straight at 0.05 m/s, swaying 2 cm sideways once in a gait cycle of a second."""
+    """A record of robots that walk straight at 0.05 m/s, with a lateral sway of 2 cm in a gait cycle of a second."""
     time = np.arange(frames) / FRAME_RATE
     position = np.zeros((robots, frames, 3))
     position[..., 0] = 0.05 * time
@@ -50,28 +50,28 @@ def walk(robots: int = 2, frames: int = 1200, **changes: np.ndarray) -> Record:
         **{name: np.zeros((robots, frames, 2)) for name in ("distances", "label", "velocity")},
         "clearance": np.full((robots, frames), 0.3),
         "contact": np.zeros((robots, frames), bool),
-        "fresh": np.zeros((robots, frames), bool),
-        "setbacks": np.zeros((robots, frames), int),
+        "is_first": np.zeros((robots, frames), bool),
+        "resets": np.zeros((robots, frames), int),
         "ok": np.ones((robots, frames), bool),
     }
     return Record(**(fields | changes))
 
 
 def walks(generator: np.random.Generator, robots: int, frames: int) -> dict[str, np.ndarray]:
-    """Wandering paths of 0.06 m/s from (0, 2.5), set back once, halfway, after a touch by robot 0."""
+    """Random paths at 0.06 m/s from (0, 2.5); robot 0 has a contact halfway and is reset."""
     turning = np.cumsum(generator.normal(0, 0.02, (robots, frames)), axis=1)
     yaw = np.cumsum(0.3 * np.tanh(turning) / FRAME_RATE, axis=1)
     steps = 0.06 / FRAME_RATE * np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=-1)
     positions = np.array([0.0, 2.5, 0.1]) + np.cumsum(steps, axis=1)
     half = frames // 2
-    setbacks, contact = np.zeros((robots, frames), int), np.zeros((robots, frames), bool)
-    setbacks[0, half:], contact[0, half - 1] = 1, True
+    resets, contact = np.zeros((robots, frames), int), np.zeros((robots, frames), bool)
+    resets[0, half:], contact[0, half - 1] = 1, True
     positions[0, half:] += np.array([-1.0, -3.0, 0.0])
-    return {"": positions, "_setbacks": setbacks, "_contact": contact}
+    return {"": positions, "_resets": resets, "_contact": contact}
 
 
 def score(rate: float) -> dict:
-    """A score as `scores.score` gives it, as JSON."""
+    """The JSON of `metrics.score`."""
 
     def estimate(value: float) -> dict[str, float]:
         return {"value": value, "low": 0.7 * value, "high": 1.4 * value}
@@ -90,7 +90,7 @@ def score(rate: float) -> dict:
 
 
 def rows_of(study: str) -> list[dict]:
-    """Rows of a study as it writes them."""
+    """Rows that a study writes."""
     rate = {"per_100_m": asdict(metrics.poisson_rate(2, 0.9)), "distance": 90.0, "collisions": 2}
     if study == "velocity":
         row = {"obstructed": 0.6, "free": 0.55, "spread": 0.02}
@@ -99,17 +99,23 @@ def rows_of(study: str) -> list[dict]:
             for v in (0.1, 1.0, 5.0)
         ]
     if study == "supervision":
-        pupils = [{"driver": "learned", "rule": "2a", "variant": "lstm", "start": start} | rate for start in range(3)]
-        return [{"driver": "teacher", "rule": "2a"} | rate, {"driver": "direct", "rule": "teacher"} | rate, *pupils]
+        learners = [{"policy": "learned", "rule": "2a", "variant": "lstm", "repeat": k} | rate for k in range(3)]
+        return [{"policy": "teacher", "rule": "2a"} | rate, {"policy": "direct", "rule": "teacher"} | rate, *learners]
     if study == "errata":
         stuck = {"per_100_m": asdict(metrics.poisson_rate(0, 0.001)), "distance": 0.1, "collisions": 0}
         row = {"case": "eq. 15", "speed": 0.05, "u": {"score": 0.7, "left": 0.5, "right": 0.6}}
         return [row | {"teacher": rate, "learned": rate}, row | {"case": "eq. 1", "teacher": stuck, "learned": stuck}]
     if study == "failure_modes":
-        away = {"avoided": asdict(metrics.wilson(9, 12)), "untouched": 9, "robots": 12, "passed": 6, "retreated": 2}
-        walls = [{"place": "white", "contrast": c, "driver": "learned"} | away for c in (0.0, 0.5)]
-        others = [{"place": "white", "contrast": 0.0, "driver": "teacher"} | away]
-        corners = [{"place": "corner", "contrast": None, "driver": name} | away for name in ("learned", "eq. 22")]
+        away = {
+            "avoided": asdict(metrics.wilson_proportion(9, 12)),
+            "untouched": 9,
+            "robots": 12,
+            "passed": 6,
+            "retreated": 2,
+        }
+        walls = [{"trial": "white", "contrast": c, "policy": "learned"} | away for c in (0.0, 0.5)]
+        others = [{"trial": "white", "contrast": 0.0, "policy": "teacher"} | away]
+        corners = [{"trial": "corner", "contrast": None, "policy": name} | away for name in ("learned", "eq. 22")]
         return walls + others + corners
     if study == "gait_gradient":
         walked = {
@@ -119,29 +125,32 @@ def rows_of(study: str) -> list[dict]:
             "roll_deg": [0.1, 0.1],
         }
         fits = [
-            {"method": m, "start": 0, "curve": [[28.8, 0.6], [57.6, 0.4]]} | walked for m in ("gradient", "evolution")
+            {"method": m, "repeat": 0, "curve": [[28.8, 0.6], [57.6, 0.4]]} | walked for m in ("gradient", "evolution")
         ]
-        return [{"method": "before", "start": 0, "curve": []} | walked, *fits]
+        return [{"method": "initial", "repeat": 0, "curve": []} | walked, *fits]
+    if study == "overlap":
+        return [{"overlap": x, "episodes": [0.8 * x, 0.7 * x], "tube": 1.0 - 0.2 * x} for x in (0.5, 0.7, 1.0)]
     if study == "gradient_horizon":
         return [
             {"contact": contact, "precision": precision, "robot": robot, "horizon": horizon, "norm": 0.1 * horizon}
-            | {"slope": 1.0, "forward": 1.0 + 1e-12, "difference": 1.0 + 1e-8}
+            | {"reverse": 1.0, "forward": 1.0 + 1e-12, "difference": 1.0 + 1e-8}
             for contact in ("hard", "soft")
             for precision in ("float64", "float32")
             for robot in range(2)
             for horizon in (1, 15)
         ]
     row = rate | {"speed": 0.05}
-    axes = [{"axis": "T_s", "value": v, "chosen": v == 1.0} | row for v in (0.5, 1.0)]
-    return axes + [{"axis": "minutes", "value": 15.0, "chosen": False, "start": k} | row for k in range(2)]
+    changed = [{"parameter": "T_s", "value": v, "is_baseline": v == 1.0} | row for v in (0.5, 1.0)]
+    learner = {"parameter": "minutes", "value": 15.0, "is_baseline": False}
+    return changed + [learner | {"repeat": k} | row for k in range(2)]
 
 
 def write_experiments(run: Path) -> Path:
-    """Add to a run folder what `--scale paper` has beside: a trial that ends, and the studies."""
+    """Add what only `--scale paper` has to a run folder: a trial that ends, and the studies."""
     facts = json.loads((run / "run.json").read_text())
-    facts["settings"]["evaluate"]["places"].append({"trial": "tube", "eyes": {"width": 320, "height": 240}})
+    facts["settings"]["evaluate"]["trials"].append({"trial": "tube", "eyes": {"width": 320, "height": 240}})
     for study in ("velocity", "supervision", "errata", "failure_modes", "sensitivity"):
-        facts["settings"][study] = {"bench": {"robots": 16, "eyes": {"width": 80, "height": 60}}}
+        facts["settings"][study] = {"benchmark": {"robots": 16, "eyes": {"width": 80, "height": 60}}}
         (run / study).mkdir()
         (run / study / "done.json").write_bytes((run / "train" / "done.json").read_bytes())
         _json(run / study / f"{study}.json", rows_of(study))
@@ -155,7 +164,7 @@ def write_experiments(run: Path) -> Path:
         "clearance": [0.1] * 30,
         "seconds": [20.0] * 30,
     }
-    outcome["avoided"] = asdict(metrics.wilson(29, 30))
+    outcome["avoided"] = asdict(metrics.wilson_proportion(29, 30))
     evaluation["tube"] = dict.fromkeys(("teacher", "learned", "blind"), outcome)
     _json(run / "evaluate" / "evaluation.json", evaluation)
     (run / "evaluate" / "tube.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
@@ -163,7 +172,7 @@ def write_experiments(run: Path) -> Path:
 
 
 def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (240, 320)) -> Path:
-    """Write every file that the report reads; give the folder."""
+    """Write every file that the report reads, and return the folder."""
     generator = np.random.default_rng(7)
     versions = {"python": "3.11.9", "lgmdjax": "0.1.0", "jax": "0.9.2", "mujoco": "3.17.0"}
     for name in ("fit-gait", "collect", "train", "evaluate"):
@@ -171,8 +180,8 @@ def write_run(folder: Path, *, frames: int = 1800, pixels: tuple[int, int] = (24
         _json(folder / name / "done.json", {"seconds": 12.5, "device": "cpu, 2 cores", "versions": versions})
     settings = {
         "fit-gait": {"steps": 3000, "seconds": 25},
-        "evaluate": {"places": [{"trial": "testing", "eyes": {"width": 80, "height": 60}}]},
-        "train": {"epochs": 40, "rounds": 2},
+        "evaluate": {"trials": [{"trial": "testing", "eyes": {"width": 80, "height": 60}}]},
+        "train": {"epochs": 40, "dagger_rounds": 2},
     }
     _json(
         folder / "run.json",
@@ -192,13 +201,13 @@ def _json(path: Path, content: object) -> None:
 def _write_gait(folder: Path, generator: np.random.Generator) -> None:
     time = np.arange(0, 8, 1 / 180)
     settled = 1 - np.exp(-time / 1.2)
-    phase = 2 * np.pi * time / PERIOD
+    phase = 2 * np.pi * time / CYCLE_TIME
     start = generator.uniform(0, 2 * np.pi, 6)
     rhythm = [0.57 * np.sin(phase + np.pi * (leg % 2) + start[leg] * (1 - settled)) * settled for leg in range(6)]
-    np.savez(folder / "cpg.npz", time=time, rhythm=np.stack(rhythm, 1), transient_cycles=3.1, period=PERIOD)
+    np.savez(folder / "cpg.npz", time=time, rhythm=np.stack(rhythm, 1), transient_cycles=3.1, period=CYCLE_TIME)
     loop = np.linspace(0, 2 * np.pi, 180)
     v = np.array([0.5, 1.0, 2.0])
-    asked = np.stack(
+    commanded = np.stack(
         [
             0.2 + 0.0125 * v[:, None] * np.cos(loop),
             np.full((3, 180), 0.16),
@@ -210,9 +219,9 @@ def _write_gait(folder: Path, generator: np.random.Generator) -> None:
     np.savez(
         folder / "foot.npz",
         velocities=v,
-        commanded=asked,
+        commanded=commanded,
         literal=literal,
-        simulated=asked + generator.normal(0, 3e-4, asked.shape),
+        simulated=commanded + generator.normal(0, 3e-4, commanded.shape),
     )
     sweep = []
     for left, right in ((-1, -1), (0.5, 0.5), (1, 1), (1.2, 1.2), (2, 2), (-1, 1), (1, -1), (0.5, 1.5)):
@@ -231,7 +240,7 @@ def _write_gait(folder: Path, generator: np.random.Generator) -> None:
     _json(
         folder / "gait.json",
         {
-            "cycle_time": PERIOD,
+            "cycle_time": CYCLE_TIME,
             "sweep": sweep,
             "literal": {"mjx": 0.0071, "c": 0.0069},
             "sway": {"pitch_deg": 0.8, "roll_deg": 1.1, "yaw_deg": 0.9, "bounce_mm": 1.4},
@@ -304,14 +313,16 @@ def _write_train(folder: Path, generator: np.random.Generator) -> None:
 
 
 def _write_evaluate(folder: Path, generator: np.random.Generator, frames: int, pixels: tuple[int, int]) -> None:
-    scores = {name: score(rate) for name, rate in RATES.items()}
+    scores = {name: score(rate) for name, rate in COLLISIONS_PER_100_M.items()}
     _json(
         folder / "evaluation.json",
-        {"testing": scores, "unseen": {name: score(1.1 * r) for name, r in RATES.items()}},
+        {"testing": scores, "unseen": {name: score(1.1 * r) for name, r in COLLISIONS_PER_100_M.items()}},
     )
     kinds = {"corner": 0, "did not see": 1, "saw both sides": 0, "tail swing": 2, "turned the other way": 0}
-    _json(folder / "kinds.json", {"testing": kinds | {"turned too late": 5}, "unseen": dict.fromkeys(KINDS, 0)})
-    paths = {f"testing_{name}{key}": value for name in DRIVERS for key, value in walks(generator, 5, frames).items()}
+    _json(folder / "kinds.json", {"testing": kinds | {"turned too late": 5}, "unseen": dict.fromkeys(CAUSES, 0)})
+    paths = {
+        f"testing_{name}{key}": value for name in POLICY_NAMES for key, value in walks(generator, 5, frames).items()
+    }
     unseen = {f"unseen_learned{key}": value for key, value in walks(generator, 4, frames).items()}
     np.savez(folder / "trajectories.npz", allow_pickle=False, **paths, **unseen)
     rows, columns = np.mgrid[: pixels[0], : pixels[1]]

@@ -1,117 +1,126 @@
-"""What every component keeps: one shape of state, one program, the same numbers however it is run, a gradient.
+"""The contract of every component: a state of fixed structure, one compilation, equal results in every mode, gradients.
 
-A component has `Params`, `State`, `init` and `step(params, state, input) -> (state, output)`. New ones join by a
-line in `COMPONENTS`; each runs in double and single precision, with implicit dtype promotion forbidden.
+A component has `Params`, `State`, `init` and `step(params, state, input) -> (state, output)`. Add new
+ones to `COMPONENTS`. Each is tested in double and single precision, with implicit dtype promotion forbidden.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, PyTree
 
-from lgmdjax.control import braitenberg, controller, navigator, policies
+from lgmdjax.control import braitenberg, controller, names, navigator, policies
 from lgmdjax.detectors import lgmd
 from lgmdjax.locomotion import cpg, shaping
 
 STEPS = 4
+Step = Callable[[PyTree, PyTree, PyTree], tuple[PyTree, PyTree]]
 
 
 @dataclass(frozen=True)
 class Component:
-    """How to build and run one.
+    """How to build and run a component.
 
     Attributes:
         name: for the test's name.
-        params: builds the parameters, in the precision of the moment.
-        init: first state, from the parameters and the first input.
+        params: builds the parameters, in the current precision.
+        init: returns the first state from the parameters and the first input.
         step: the component's step.
-        inputs: `STEPS` inputs from a generator, stacked.
-        flat: names of parameters whose gradient is zero here, and why it may be.
-        plain: run it without jit too; not worth its minutes for what only composes others.
+        inputs: returns `STEPS` inputs, stacked, from a random generator.
+        zero_gradient: names of parameters whose gradient is zero here; a comment says why.
+        eager: whether to run it without jit too, which takes minutes for a composition of other components.
     """
 
     name: str
-    params: Callable[[], Any]
-    init: Callable[[Any, Any], Any]
-    step: Callable[[Any, Any, Any], tuple[Any, Any]]
-    inputs: Callable[[np.random.Generator], Any]
-    flat: tuple[str, ...] = ()
-    plain: bool = True
+    params: Callable[[], PyTree]
+    init: Callable[[PyTree, PyTree], PyTree]
+    step: Step
+    inputs: Callable[[np.random.Generator], PyTree]
+    zero_gradient: tuple[str, ...] = ()
+    eager: bool = True
 
 
-def pictures(*shape: int) -> Callable[[np.random.Generator], Any]:
-    """Quiet noise, whose changes lie about the thresholds."""
+def noise(*shape: int) -> Callable[[np.random.Generator], Array]:
+    """Weak noise, whose changes are near the thresholds."""
     return lambda rng: jnp.asarray(rng.uniform(100, 130, (STEPS, *shape)), dtype=float)
 
 
-def between(low: float, high: float, *shape: int) -> Callable[[np.random.Generator], Any]:
+def uniform(low: float, high: float, *shape: int) -> Callable[[np.random.Generator], Array]:
     return lambda rng: jnp.asarray(rng.uniform(low, high, (STEPS, *shape)), dtype=float)
 
 
-def smooth() -> lgmd.Params:
+def smooth_lgmd() -> lgmd.Params:
     return lgmd.Params(threshold=5.0, suppression=12.0, smooth=True)
 
 
-def guided() -> controller.Params:
-    """The rhythm in one Runge-Kutta step: four take long to compile, and are tested by themselves."""
+def learned_controller() -> controller.Params:
+    """With one Runge-Kutta step per frame: four take long to compile, and are tested with the CPG."""
     return controller.Params(
-        lgmd=smooth(),
-        driver=navigator.create(jax.random.key(1)),
+        lgmd=smooth_lgmd(),
+        policy=navigator.create(jax.random.key(1)),
         cpg=cpg.Params(substeps=1),
         shaping=shaping.init(jax.random.key(2)),
     )
 
 
-def open_nerves(params: controller.Params, frames: Any) -> controller.State:
+def init_controller(params: controller.Params, frames: Array) -> controller.State:
     return controller.init(params, frames, policies.LEARNED, jax.random.key(0))
 
 
-def looks(_: np.random.Generator) -> policies.Senses:
-    """Frames quiet enough for a command within the gait's range, and so unlike that both its ends are met."""
+def observations(_: np.random.Generator) -> policies.Observation:
+    """Responses that command velocities within the gait's range, including both of its ends."""
     u = jnp.asarray([[0.52, 0.55], [0.9, 0.55], [0.6, 0.7], [0.8, 0.85]], dtype=float)
-    nothing = jnp.zeros_like(u)
-    return policies.Senses(u=u, feed_forward=nothing, excitation=nothing, distances=nothing)
+    zero = jnp.zeros_like(u)
+    return policies.Observation(u=u, feed_forward=zero, excitation=zero, distances=zero)
 
 
-def driven(driver: policies.Driver, params: Callable[[], Any], flat: tuple[str, ...] = ()) -> Component:
+def policy_component(
+    policy: policies.Policy, params: Callable[[], PyTree], zero_gradient: tuple[str, ...] = ()
+) -> Component:
     return Component(
-        driver.name, params, lambda params, _: driver.init(params, jax.random.key(4)), driver.step, looks, flat
+        policy.name,
+        params,
+        lambda params, _: policy.init(params, jax.random.key(4)),
+        policy.step,
+        observations,
+        zero_gradient,
     )
 
 
-# `simulation` has this shape too, but is not here, since MuJoCo's step takes long to compile. Where it is compiled
-# anyway, test_simulation holds that its state can be scanned and that chunks of a crowd are one robot's walk, and
-# test_imitation that reverse and forward mode agree in every parameter of the controller.
+# `closed_loop` follows the contract too, but is not here, since MuJoCo's step takes long to compile. Where it is
+# compiled anyway, test_closed_loop checks that its state can be scanned and that chunks of a batch equal the rollout of
+# one robot, and test_rollout_gradient checks that both modes agree in every parameter of the controller.
 COMPONENTS = (
-    Component("lgmd", smooth, lgmd.init, lgmd.step, pictures(12, 16)),
+    Component("lgmd", smooth_lgmd, lgmd.init, lgmd.step, noise(12, 16)),
     Component(
         "lgmd-hard",
         lambda: lgmd.Params(threshold=5.0),
         lgmd.init,
         lgmd.step,
-        pictures(12, 16),
-        flat=("threshold", "suppression", "threshold_width", "suppression_width"),  # steps
+        noise(12, 16),
+        zero_gradient=("threshold", "suppression", "threshold_width", "suppression_width"),  # steps
     ),
     Component(
         "cpg",
         lambda: cpg.Params(substeps=2),
         lambda params, _: cpg.init(params, jax.random.key(0)),
         cpg.step,
-        between(0.02, 0.03),
+        uniform(0.02, 0.03),
     ),
     Component(
         "teacher",
         braitenberg.Params,
         lambda params, _: braitenberg.init(params),
         braitenberg.step,
-        # Near enough for the tie-break, far enough for the range: all limits but the slowest are touched.
+        # Near and far distances, so that the tie-break and all limits but the lowest velocity apply.
         lambda rng: jnp.asarray([[0.7, 0.8], [0.8, 4.0], [1.5, 2.0], [0.66, 0.61]], dtype=float),
-        flat=("slowest", "symmetry", "steady", "first_side"),  # a bound not touched, comparisons, a choice
+        # A limit that does not apply, comparisons, a choice.
+        zero_gradient=("min_velocity", "tie_tolerance", "turn_deadband", "default_side"),
     ),
     *(
         Component(
@@ -119,50 +128,60 @@ COMPONENTS = (
             lambda variant=variant: navigator.create(jax.random.key(1), variant),
             lambda params, _: navigator.init(params),
             navigator.step,
-            between(0.5, 1.0, 2),
-            flat=("input_mean", "input_scale", "output_scale") if variant == "mean" else (),
+            uniform(0.5, 1.0, 2),
+            zero_gradient=("input_mean", "input_scale", "output_scale") if variant == "mean" else (),
         )
-        for variant in navigator.VARIANTS
+        for variant in names.VARIANTS
     ),
     Component(
         "navigator-symmetric",
         lambda: navigator.create(jax.random.key(1), symmetric=True),
         lambda params, _: navigator.init(params),
         navigator.step,
-        between(0.5, 1.0, 2),
+        uniform(0.5, 1.0, 2),
     ),
-    driven(policies.BLIND, lambda: policies.Blind(velocity=jnp.asarray([1.2, 1.1]))),
-    driven(
+    policy_component(policies.BLIND, lambda: policies.BlindParams(velocity=jnp.asarray([1.2, 1.1]))),
+    policy_component(
         policies.DIRECT,
-        lambda: policies.Direct(rule=braitenberg.Params(), gain=jnp.asarray(10.0)),
-        flat=("near", "close", "full_turn", "symmetry", "steady", "first_side"),  # the teacher's own departures
+        lambda: policies.DirectParams(rule=braitenberg.Params(), gain=jnp.asarray(10.0)),
+        # The teacher's deviations from eq. 22.
+        zero_gradient=(
+            "turn_distance",
+            "full_turn_distance",
+            "full_turn",
+            "tie_tolerance",
+            "turn_deadband",
+            "default_side",
+        ),
     ),
-    driven(policies.RANDOM, lambda: policies.Replay(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0], [1.2, 0.9]]))),
+    policy_component(
+        policies.REPLAY, lambda: policies.ReplayParams(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0], [1.2, 0.9]]))
+    ),
     Component(
         "controller",
-        guided,
-        open_nerves,
+        learned_controller,
+        init_controller,
         lambda params, state, frames: controller.step(params, state, frames, policies.LEARNED, 1 / 30),
-        pictures(2, 12, 16),
-        plain=False,
+        noise(2, 12, 16),
+        eager=False,
     ),
 )
 each = pytest.mark.parametrize("component", COMPONENTS, ids=lambda component: component.name)
 pytestmark = pytest.mark.usefixtures("precision", "strict")
 
 
-def built(component: Component) -> tuple[Any, Any, Any]:
-    """Parameters, first state, inputs."""
+def build(component: Component) -> tuple[PyTree, PyTree, PyTree]:
+    """Return parameters, first state and inputs."""
     params, inputs = component.params(), component.inputs(np.random.default_rng(5))
     return params, component.init(params, at(inputs, 0)), inputs
 
 
-def at(tree: Any, k: int) -> Any:
+def at(tree: PyTree, k: int) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[k], tree)
 
 
-def looped(step: Callable, params: Any, state: Any, inputs: Any) -> tuple[Any, Any]:
-    """Run by a Python loop; last state, and stacked outputs."""
+def run_loop(step: Step, params: PyTree, state: PyTree, inputs: PyTree) -> tuple[PyTree, PyTree]:
+    """Run steps in a Python loop; return the last state and the stacked outputs."""
     outputs = []
     for k in range(STEPS):
         state, output = step(params, state, at(inputs, k))
@@ -170,42 +189,42 @@ def looped(step: Callable, params: Any, state: Any, inputs: Any) -> tuple[Any, A
     return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs)
 
 
-def assert_same(a: Any, b: Any) -> None:
-    """Equal up to the rounding of another order of sums."""
+def assert_same(a: PyTree, b: PyTree) -> None:
+    """Compare up to rounding errors of another order of sums."""
     tolerance = 1e-10 if jax.config.jax_enable_x64 else 2e-4  # pyright: ignore[reportAttributeAccessIssue]
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance)
 
 
-def kind(tree: Any) -> Any:
-    """Structure, and shape and dtype of every leaf."""
+def signature(tree: PyTree) -> tuple[object, list]:
+    """Return the structure, and shape and dtype of every leaf."""
     return jax.tree.structure(tree), [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
 
 
 @each
-def test_state_keeps_its_kind_and_precision(component):
-    params, state, inputs = built(component)
-    after, output = jax.eval_shape(component.step, params, state, at(inputs, 0))
-    assert kind(after) == kind(jax.eval_shape(lambda: state))
-    for leaf in jax.tree.leaves((after, output)):
+def test_state_keeps_structure_shapes_and_dtypes(component):
+    params, state, inputs = build(component)
+    next_state, output = jax.eval_shape(component.step, params, state, at(inputs, 0))
+    assert signature(next_state) == signature(jax.eval_shape(lambda: state))
+    for leaf in jax.tree.leaves((next_state, output)):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
             assert leaf.dtype == jnp.zeros(()).dtype
 
 
 @each
-def test_jit_scan_and_vmap_equal_plain_steps_and_compile_once(component):
-    params, state, inputs = built(component)
+def test_jit_scan_and_vmap_equal_eager_steps_and_compile_once(component):
+    params, state, inputs = build(component)
     traced = []
 
     @jax.jit
-    def step(params: Any, state: Any, now: Any) -> tuple[Any, Any]:
+    def step(params: PyTree, state: PyTree, value: PyTree) -> tuple[PyTree, PyTree]:
         traced.append(state)
-        return component.step(params, state, now)
+        return component.step(params, state, value)
 
-    compiled = looped(step, params, state, inputs)
-    assert len(traced) == 1, "a state that came back is of another kind than the first"
-    if component.plain:
+    compiled = run_loop(step, params, state, inputs)
+    assert len(traced) == 1, "the returned state differs in structure, shape or dtype from the first"
+    if component.eager:
         assert_same(component.step(params, state, at(inputs, 0)), step(params, state, at(inputs, 0)))
     scanned = jax.jit(partial(jax.lax.scan, partial(component.step, params)))
     assert_same(scanned(state, inputs), compiled)
@@ -218,14 +237,14 @@ def test_jit_scan_and_vmap_equal_plain_steps_and_compile_once(component):
 
 @each
 def test_gradient_is_finite_and_reaches_every_parameter(component):
-    params, _, inputs = built(component)
+    params, _, inputs = build(component)
 
     @jax.jit
     @jax.grad
-    def gradient(params: Any) -> Any:
+    def gradient(params: PyTree) -> PyTree:
         start = component.init(params, at(inputs, 0))
         _, outputs = jax.lax.scan(partial(component.step, params), start, inputs)
-        # Weighted, since the sum of two sides can be blind to what moves both.
+        # Weighted, since the sum of both sides may not depend on what changes them in opposite ways.
         return sum(jnp.sum(leaf * _weights(leaf)) for leaf in jax.tree.leaves(outputs))
 
     leaves, _ = jax.tree.flatten_with_path(gradient(params))
@@ -233,11 +252,11 @@ def test_gradient_is_finite_and_reaches_every_parameter(component):
     for path, leaf in leaves:
         name = jax.tree_util.keystr(path)
         assert np.all(np.isfinite(leaf)), name
-        if any(flat in name for flat in component.flat):
-            assert np.all(leaf == 0), f"{name} has a gradient after all: take it off the list"
+        if any(zero in name for zero in component.zero_gradient):
+            assert np.all(leaf == 0), f"expected a zero gradient of {name}, got another; remove it from zero_gradient"
         else:
             assert np.any(leaf != 0), name
 
 
-def _weights(leaf: Any) -> Any:
+def _weights(leaf: PyTree) -> PyTree:
     return jnp.cos(1 + jnp.arange(leaf.size, dtype=leaf.dtype)).reshape(leaf.shape)

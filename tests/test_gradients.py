@@ -1,40 +1,41 @@
-"""Every part between the eyes and the servos has one derivative, by reverse mode, forward mode and differences.
+"""Derivatives of every component between eyes and servos: reverse mode, forward mode and central differences agree.
 
-The camera's stand in test_camera, the solver's in test_implicit, those of whole frames in test_imitation.
+Those of the camera are tested in `sensors/test_camera.py`, of the contact solver in `body/test_implicit_step.py`, and
+of whole frames in `learning/test_rollout_gradient.py`.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from slopes import assert_three_ways_agree
+from derivatives import assert_derivatives_agree
 
 from lgmdjax.body import hexapod
-from lgmdjax.control import navigator
+from lgmdjax.control import names, navigator
 from lgmdjax.detectors import lgmd
 from lgmdjax.locomotion import cpg, kinematics, shaping
 
 RNG = np.random.default_rng(7)
 
 
-def weighed(tree):
-    """Sum with weights that are blind to nothing."""
+def weighted_sum(tree):
+    """Return the sum of all elements with a different weight for each."""
     return sum(jnp.sum(leaf * jnp.cos(1 + jnp.arange(leaf.size)).reshape(leaf.shape)) for leaf in jax.tree.leaves(tree))
 
 
 def test_lgmd():
-    """Its smooth form, in parameters and pictures."""
+    """With smooth thresholds, with respect to parameters and pictures."""
     pictures = jnp.asarray(RNG.uniform(100, 130, (6, 12, 16)))
     params = lgmd.Params(threshold=5.0, suppression=12.0, smooth=True)
 
-    def told(params, pictures):
+    def loss(inputs):
+        params, pictures = inputs
         _, response = jax.lax.scan(
             lambda state, picture: lgmd.step(params, state, picture), lgmd.init(params, pictures[0]), pictures[1:]
         )
-        return weighed(response)
+        return weighted_sum(response)
 
-    numbers = jax.tree.map(lambda x: jnp.asarray(x, float), params)
-    assert_three_ways_agree(lambda both: told(*both), (numbers, pictures))
+    assert_derivatives_agree(loss, (jax.tree.map(lambda x: jnp.asarray(x, float), params), pictures))
 
 
 def test_cpg_over_three_cycles():
@@ -42,36 +43,35 @@ def test_cpg_over_three_cycles():
     steps = 180
     start = cpg.init(params, jax.random.key(1))
 
-    def told(params):
-        # Of the drive too, by which the start was scaled.
+    def loss(params):
+        # With respect to the drive too, although the start was scaled by it.
         _, rhythm = jax.lax.scan(lambda s, _: cpg.step(params, s, 3 * cpg.CYCLE_TIME / steps), start, length=steps)
-        return weighed(rhythm)
+        return weighted_sum(rhythm)
 
-    assert_three_ways_agree(told, params, rtol=1e-5)
+    assert_derivatives_agree(loss, params, rtol=1e-5)
 
 
 def test_shaping():
-    params, rhythm = shaping.taught(), jnp.asarray(RNG.normal(size=(6, 2)))
-    both = (params, rhythm, jnp.asarray([1.1, 0.7]))
-    assert_three_ways_agree(lambda both: weighed(shaping.shape(*both)), both)
+    params, rhythm = shaping.load_pretrained(), jnp.asarray(RNG.normal(size=(6, 2)))
+    inputs = (params, rhythm, jnp.asarray([1.1, 0.7]))
+    assert_derivatives_agree(lambda inputs: weighted_sum(shaping.apply(*inputs)), inputs)
 
 
-@pytest.mark.parametrize("variant", navigator.VARIANTS)
-def test_window_of_the_navigator(variant):
+@pytest.mark.parametrize("variant", names.VARIANTS)
+def test_navigator_over_a_window(variant):
     params, u = navigator.create(jax.random.key(2), variant), jnp.asarray(RNG.uniform(0.5, 1.0, (60, 2)))
 
-    def told(params, u):
+    def loss(inputs):
+        params, u = inputs
         _, velocity = jax.lax.scan(lambda s, u: navigator.step(params, s, u), navigator.init(params), u)
-        return weighed(velocity)
+        return weighted_sum(velocity)
 
-    assert_three_ways_agree(lambda both: told(*both), (params, u))
+    assert_derivatives_agree(loss, (params, u))
 
 
 def test_kinematics_of_the_legs():
-    geometry, angles = (
-        kinematics.geometry(hexapod.load()),
-        jnp.asarray(hexapod.stance() + RNG.uniform(-0.3, 0.3, (6, 3))),
-    )
-    assert_three_ways_agree(lambda angles: weighed(kinematics.forward(geometry, angles)), angles)
+    geometry = kinematics.read_geometry(hexapod.load())
+    angles = jnp.asarray(hexapod.stance() + RNG.uniform(-0.3, 0.3, (6, 3)))
+    assert_derivatives_agree(lambda angles: weighted_sum(kinematics.forward(geometry, angles)), angles)
     feet = kinematics.forward(geometry, angles)
-    assert_three_ways_agree(lambda feet: weighed(kinematics.inverse(geometry, feet)), feet)
+    assert_derivatives_agree(lambda feet: weighted_sum(kinematics.inverse(geometry, feet)), feet)

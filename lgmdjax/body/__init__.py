@@ -1,1 +1,5 @@
-"""The hexapod in MuJoCo MJX, and a physics step that reverse mode can differentiate."""
+"""The hexapod in MuJoCo MJX, and a physics step that is differentiable in reverse mode."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,21 +1,24 @@
-"""The robot's body: a MuJoCo model of a PhantomX AX Mark II class hexapod, and what reads and moves it.
+"""The robot's body: the MuJoCo model of a hexapod of the PhantomX AX Mark II class, its sensors' poses and its physics.
 
-`mjcf/hexapod.xml` is the home of every mass, length, limit and gain; this module turns its names into static
-indices and reads poses out of `mjx.Data`. The `mjx.Model` is an argument everywhere, so that robots in rooms
-of their own are a `vmap`: the physics has a plane for each shape that collides, which `place_obstacles` puts before
-what is nearest. More would cost: in MJX every pair that may touch is computed in each step.
+`mjcf/hexapod.xml` defines every mass, length, limit and gain, with its source. This module maps the names in that file
+to static indices and reads poses from `mjx.Data`.
 
-| symbol  | name                                              | unit               |
-| ------- | ------------------------------------------------- | ------------------ |
-| qpos    | trunk's position, its quaternion, 18 joint angles | m; 1 (w x y z); rad |
-| targets | servo set points (6, 3): a row a leg, as in LEGS  | rad                |
+The `mjx.Model` is an argument everywhere, so that `vmap` gives each robot its own room. The obstacles of a room are not
+part of the model. Instead it has one plane, a barrier, for each geom that collides with obstacles, and `place_barriers`
+puts it at the nearest obstacle. This keeps the physics fast, since MJX evaluates in each step every pair of geoms that
+may collide.
 
-World and trunk frames: x forward, y left, z up. The sources of the numbers stand in the XML.
+| symbol  | name                                                  | unit                |
+| ------- | ----------------------------------------------------- | ------------------- |
+| qpos    | position and quaternion of the trunk, 18 joint angles | m; 1 (w x y z); rad |
+| targets | servo set points (6, 3), one row per leg as in LEGS   | rad                 |
+
+World and trunk frames: x forward, y left, z up.
 """
 
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,90 +27,101 @@ import numpy as np
 from flax import struct
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
-from mujoco import mjx
 
 from lgmdjax.body import implicit_step
 from lgmdjax.errors import InputError
-from lgmdjax.paths import MJCF
+from lgmdjax.geometry import rotation_matrix
+from lgmdjax.paths import MJCF_DIRS
+from lgmdjax.runtime.mjx import mjx
 from lgmdjax.world import arena
+
+Tree = TypeVar("Tree")
 
 LEGS = ("left_front", "left_middle", "left_rear", "right_rear", "right_middle", "right_front")
 JOINTS = ("coxa", "femur", "tibia")
 EYES = ("eye_left", "eye_right")
-CAPSULES = ("bumper", *(f"{leg}_{part}" for leg in LEGS for part in JOINTS[1:]))  # what collides, in capsules' order
-LOWEST, HIGHEST = 0.04, 0.30  # m; where the trunk of a robot on its feet can be
-LEAST_UPRIGHT = 0.7  # cosine of the trunk's tilt; below it (45 degrees) the robot has fallen
+CAPSULES = ("bumper", *(f"{leg}_{part}" for leg in LEGS for part in JOINTS[1:]))  # geoms that collide with obstacles
+MIN_TRUNK_HEIGHT, MAX_TRUNK_HEIGHT = 0.04, 0.30  # m; range of the trunk of a robot that stands on its feet
+MIN_UPRIGHT = 0.7  # cosine of the trunk's tilt; below it (45 degrees) the robot has fallen
 
 
 @struct.dataclass(kw_only=True)
 class Pose:
-    """Where the trunk is: enough to draw what the eyes see and what the laser measures."""
+    """Position and orientation of the trunk, from which the poses of eyes and laser follow."""
 
     position: Float[Array, "3"]  # m, world
     quaternion: Float[Array, "4"]  # w x y z
 
 
 class _Anatomy(NamedTuple):
-    """Indices and offsets that the XML fixes, read once."""
+    """Indices and offsets in the XML, read once."""
 
     stance: np.ndarray  # (25,) qpos of the default stance
     eyes: np.ndarray  # (2, 3) m, in the trunk's frame
     laser: np.ndarray  # (3,) m, in the trunk's frame
-    capsules: np.ndarray  # (13,) geoms that collide with obstacles
-    feet: np.ndarray  # (6,) geoms that stand on the floor
-    barriers: np.ndarray  # (13,) planes, one for each of the capsules
-    shapes: tuple[str, ...]  # names of all geoms
+    capsules: np.ndarray  # (13,) ids of `CAPSULES`
+    feet: np.ndarray  # (6,) ids of the geoms that stand on the floor
+    barriers: np.ndarray  # (13,) ids of planes, one for each capsule
+    geom_names: tuple[str, ...]  # all geoms
 
 
 def xml_path() -> Path:
-    """Find the robot's XML: inside the installed package, else beside it in the checkout."""
-    for place in MJCF:
-        if (place / "hexapod.xml").is_file():
-            return place / "hexapod.xml"
-    raise InputError(f"expected hexapod.xml in {' or '.join(map(str, MJCF))}, found none: reinstall lgmdjax")
+    """Return the path of the robot's XML: in the installed package, or next to it in a checkout."""
+    for folder in MJCF_DIRS:
+        if (folder / "hexapod.xml").is_file():
+            return folder / "hexapod.xml"
+    raise InputError(f"expected hexapod.xml in {' or '.join(map(str, MJCF_DIRS))}, got none; reinstall lgmdjax")
 
 
 def load(path: Path | str | None = None) -> mujoco.MjModel:
-    """Load the robot, or a variant of it with the same names from a file of the user's, for C MuJoCo."""
+    """Load the robot for C MuJoCo: the package's, or a variant with the same names from the file `path`.
+
+    >>> load().nu  # servos
+    18
+    """
     path = xml_path() if path is None else Path(path)
     if not path.is_file():
-        raise InputError(f"expected a robot's XML file, {path} is none: give the path of a hexapod.xml")
+        raise InputError(
+            f"expected a robot's XML file, got {path}, which does not exist; give the path of a hexapod.xml"
+        )
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"expected a MuJoCo model in {path}, it does not compile ({reason}): mend it") from None
+        raise InputError(
+            f"expected a MuJoCo model in {path}, got one that does not compile ({reason}); correct it"
+        ) from None
     servos = [model.actuator(i).name for i in range(model.nu)]
     expected = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
     if servos != expected:
         raise InputError(
             f"expected {len(expected)} servos {expected[0]} ... {expected[-1]} in {path}, got {len(servos)}"
-            f" ({', '.join(servos[:3])} ...): start from the hexapod.xml of this package"
+            f" ({', '.join(servos[:3])} ...); start from the hexapod.xml of this package"
         )
     return model
 
 
 def build(model: mujoco.MjModel | None = None) -> mjx.Model:
-    """Put the robot (default: `load()`) on the device for MJX, in the precision that JAX is set to.
+    """Convert the robot (default: `load()`) to an MJX model, in JAX's current default precision.
 
-    Raises InputError for a variant whose shapes are not those of the package's XML, or in another order.
+    Raises InputError for a variant whose geoms differ from those of the package's XML, or have another order.
     """
     model = load() if model is None else model
-    for expected, found in zip(_anatomy().shapes, _shapes(model), strict=False):
+    for expected, found in zip(_anatomy().geom_names, _geom_names(model), strict=False):
         if found != expected:
             raise InputError(
                 f"expected the geoms of this package's hexapod.xml in its order, got {found or 'one without a name'} "
-                f"for {expected}: start from that file, and add others at its end"
+                f"for {expected}; start from that file, and add other geoms at its end"
             )
     with jax.numpy_dtype_promotion("standard"):
-        return _free(mjx.put_model(model, impl="jax"))
+        return _uncommit(mjx.put_model(model, impl="jax"))
 
 
-def softened(model: mjx.Model) -> mjx.Model:
-    """Soften the contacts (solref 0.06, solimp 0.2 0.9 0.02), so that a derivative says more about larger steps.
+def soften_contacts(model: mjx.Model) -> mjx.Model:
+    """Return the model with soft contacts, whose derivative is valid over larger steps.
 
-    With the contacts of the XML, differences over 3e-2 rad are a quarter off the derivative; with these all scales
-    agree within 2 %.
+    Soft contacts have solref 0.06 and solimp 0.2 0.9 0.02. With the contacts of the XML, differences over 3e-2 rad
+    deviate from the derivative by a quarter; with soft contacts, differences of all sizes agree within 2 %.
     """
     solref = jnp.zeros_like(model.pair_solref) + jnp.array([0.06, 1.0], model.pair_solref.dtype)
     solimp = model.pair_solimp.at[:, :3].set(jnp.array([0.2, 0.9, 0.02], model.pair_solimp.dtype))
@@ -116,50 +130,63 @@ def softened(model: mjx.Model) -> mjx.Model:
 
 @cache
 def _anatomy() -> _Anatomy:
+    """Read indices and offsets from the XML."""
     model = load()
 
-    def geoms(names: list[str]) -> np.ndarray:
-        # Of 32 bits in either precision: JAX remembers of an array of 64 the precision in which it met it first.
+    def geom_ids(names: list[str]) -> np.ndarray:
+        # 32 bits in both precisions: JAX caches a 64-bit array in the precision of its first use.
         return np.array([model.geom(name).id for name in names], dtype=np.int32)
 
     return _Anatomy(
         stance=model.key("stance").qpos.copy(),
         eyes=np.stack([model.site(name).pos for name in EYES]),
         laser=model.site("laser").pos.copy(),
-        capsules=geoms([*CAPSULES]),
-        feet=geoms([f"{leg}_foot" for leg in LEGS]),
-        barriers=geoms([f"before_{name}" for name in CAPSULES]),
-        shapes=_shapes(model),
+        capsules=geom_ids([*CAPSULES]),
+        feet=geom_ids([f"{leg}_foot" for leg in LEGS]),
+        barriers=geom_ids([f"before_{name}" for name in CAPSULES]),
+        geom_names=_geom_names(model),
     )
 
 
-def _shapes(model: mujoco.MjModel) -> tuple[str, ...]:
+def _geom_names(model: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(model.geom(index).name for index in range(model.ngeom))
 
 
-def _free(tree: Any) -> Any:
-    """Untie arrays from the device that MJX put them on.
+def _uncommit(tree: Tree) -> Tree:
+    """Return a pytree of arrays that are not committed to the device on which MJX put them.
 
-    Tied ones would not be sharded with others, and `jit` compiles anew for each mixture of tied and free arguments.
+    Committed arrays would not be sharded with others, and `jit` would compile again for each combination of committed
+    and uncommitted arguments.
     """
     return jax.tree.map(lambda leaf: leaf if isinstance(leaf, Tracer) else jnp.array(np.asarray(leaf)), tree)
 
 
 def stance() -> Float[np.ndarray, "6 3"]:
-    """Return the joint angles [rad] of the default stance (the XML's key frame)."""
+    """Return the joint angles [rad] of the default stance (the key frame of the XML).
+
+    >>> stance().shape
+    (6, 3)
+    """
     return _anatomy().stance[7:].reshape(6, 3)
 
 
-def reset(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
-    """Stand a robot still on the floor at (x, y, yaw) [m, m, rad], by default in the key frame's stance."""
-    # put_data's contact indices are narrower than a step's under x64, and a loop's carry must keep its types.
-    with jax.numpy_dtype_promotion("standard"):  # MJX multiplies truth values by floats
-        data = _free(mjx.make_data(model))
-    return put(data, start, angles)
+def init(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
+    """Create the state of a robot that stands at rest on the floor.
+
+    Args:
+        model: from `build`.
+        start: x, y, yaw [m, m, rad].
+        angles: joint angles [rad]; the default stance if None.
+    """
+    # Not `put_data`: under x64 its contact indices are narrower than those of a step, and the carry of a loop must keep
+    # its types.
+    with jax.numpy_dtype_promotion("standard"):  # MJX multiplies booleans by floats
+        data = _uncommit(mjx.make_data(model))
+    return reset(data, start, angles)
 
 
-def put(data: mjx.Data, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
-    """Lift a robot and put it down again, still, at (x, y, yaw) [m, m, rad]; angles as in `reset`."""
+def reset(data: mjx.Data, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
+    """Return the state of the same robot at rest at a new start pose; arguments as in `init`."""
     stance = jnp.asarray(_anatomy().stance, data.qpos.dtype)
     joints = stance[7:] if angles is None else angles.reshape(18).astype(stance.dtype)
     x, y, yaw = start.astype(stance.dtype)
@@ -175,121 +202,126 @@ def put(data: mjx.Data, start: Float[Array, "3"], angles: Float[Array, "6 3"] | 
 
 
 def substep(model: mjx.Model, data: mjx.Data, targets: Float[Array, "6 3"]) -> mjx.Data:
-    """Advance the physics by the XML's time step (1/180 s) with the servos' set points at `targets` [rad].
+    """Advance the physics by the time step of the XML (1/180 s) with the servos' set points at `targets` [rad].
 
     Set points beyond the joint limits are clipped.
 
-    Gradient: by either mode, of the solver's solution (`lgmdjax.body.implicit_step`); zero for a target that is
-    clipped and for a servo at its torque limit.
+    Gradient: that of the solver's solution, in both modes (`lgmdjax.body.implicit_step`). It is zero for a target that
+    is clipped and for a servo at its torque limit.
     """
-    with jax.numpy_dtype_promotion("standard"):  # MJX multiplies truth values by floats
+    with jax.numpy_dtype_promotion("standard"):  # MJX multiplies booleans by floats
         return implicit_step.step(model, data.replace(ctrl=targets.reshape(18).astype(data.ctrl.dtype)))
 
 
-def place_obstacles(model: mjx.Model, room: arena.Arena, data: mjx.Data) -> mjx.Model:
-    """Put a barrier between each shape that collides and what is nearest to it where the robot stands.
+def place_barriers(model: mjx.Model, room: arena.Arena, data: mjx.Data) -> mjx.Model:
+    """Place a barrier between each geom that collides and the obstacle nearest to it.
 
-    A barrier is an upright plane that touches the nearest obstacle or wall (`arena.tangents`): it is as far off as
-    that. It is meant for a frame: planes have no end, and a foot in swing, which moves by a centimetre or two until
-    the next, may meet air beyond the edge of a thing. Of two things that a shape would touch at once, as the walls of
-    a corner, it knows the nearer one only. What counts as a touch is measured apart (`arena.clearance`).
+    A barrier is an upright plane that touches the nearest obstacle or wall (`arena.separating_lines`), at the same
+    distance from the geom. It is valid for one camera frame. Planes are infinite, and a foot in swing, which moves by
+    one or two centimetres in a frame, may hit a plane beyond the edge of its obstacle. If a geom touches two obstacles
+    at once, as two walls in a corner, only the nearer one has a barrier. Contacts are detected separately
+    (`arena.clearance`).
 
-    Gradient: by the room and by the pose, through where and how the planes stand; which thing is nearest has none.
+    Gradient: with respect to room and pose, through position and orientation of the planes; none through the choice of
+    the nearest obstacle.
     """
     with jax.numpy_dtype_promotion("standard"):
         starts, ends, _ = capsules(model, mjx.kinematics(model, data))
-    normals, offsets = arena.tangents(room, starts, ends)
+    normals, offsets = arena.separating_lines(room, starts, ends)
     x, y = normals.T
     zero = jnp.zeros_like(x)
-    # The quarter turn about (-y, x, 0) that takes a plane's own normal, z, to (x, y, 0).
-    turn = jnp.sqrt(0.5) * jnp.stack([zero + 1, -y, x, zero], axis=1)
+    # The rotation by 90 degrees about (-y, x, 0), which rotates the normal of a plane from z to (x, y, 0).
+    quaternion = jnp.sqrt(0.5) * jnp.stack([zero + 1, -y, x, zero], axis=1)
     position = jnp.stack([offsets * x, offsets * y, zero], axis=1)
     ids = _anatomy().barriers
     return model.replace(
         geom_pos=model.geom_pos.at[ids].set(position.astype(model.geom_pos.dtype)),
-        geom_quat=model.geom_quat.at[ids].set(turn.astype(model.geom_quat.dtype)),
+        geom_quat=model.geom_quat.at[ids].set(quaternion.astype(model.geom_quat.dtype)),
     )
 
 
 def pose(data: mjx.Data) -> Pose:
-    """Read the trunk's position [m] and quaternion."""
+    """Return the trunk's position [m] and quaternion."""
     return Pose(position=data.qpos[:3], quaternion=data.qpos[3:7])
 
 
 def rotation(pose: Pose) -> Float[Array, "3 3"]:
-    """Return the matrix that turns the trunk's frame into the world's."""
-    w, x, y, z = pose.quaternion
-    return jnp.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """Return the matrix that rotates the trunk frame into the world frame.
+
+    >>> rotation(Pose(position=jnp.zeros(3), quaternion=jnp.array([1.0, 0.0, 0.0, 0.0]))).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    return jnp.asarray(rotation_matrix(pose.quaternion))
 
 
 def yaw(pose: Pose) -> Float[Array, ""]:
     """Return the heading [rad] in (-pi, pi], positive to the left.
 
-    Gradient: undefined with the nose straight up.
+    Gradient: undefined where the trunk points straight up or down.
     """
     forward = rotation(pose)[:, 0]
     return jnp.arctan2(forward[1], forward[0])
 
 
-def swaying(pose: Pose, factor: Float[Array, ""]) -> Pose:
-    """Multiply the angle by which a pose is tilted, its heading kept: 0 is level. Not differentiable when level."""
+def scale_tilt(pose: Pose, factor: Float[Array, ""]) -> Pose:
+    """Multiply the tilt angle of a pose by `factor` and keep its heading; 0 gives a level pose.
+
+    Gradient: undefined at a level pose.
+    """
     w, x, y, z = pose.quaternion
     length = jnp.hypot(w, z)
-    c, s = w / length, z / length  # of half the heading: the pose is a tilt about a level axis, then the heading
+    c, s = (
+        w / length,
+        z / length,
+    )  # of half the heading: a pose is a tilt about a level axis, then a rotation by the heading
     a, b = c * x + s * y, c * y - s * x
-    size = jnp.hypot(a, b)
-    half = factor * jnp.arctan2(size, length)
-    grown = jnp.where(size > 0, jnp.sin(half) / jnp.where(size > 0, size, 1.0), 0.0)
-    a, b = grown * a, grown * b
+    sine = jnp.hypot(a, b)
+    half = factor * jnp.arctan2(sine, length)
+    ratio = jnp.where(sine > 0, jnp.sin(half) / jnp.where(sine > 0, sine, 1.0), 0.0)
+    a, b = ratio * a, ratio * b
     quaternion = jnp.stack([c * jnp.cos(half), c * a - s * b, c * b + s * a, s * jnp.cos(half)])
     return Pose(position=pose.position, quaternion=quaternion)
 
 
 def eye_poses(pose: Pose) -> tuple[Float[Array, "2 3"], Float[Array, "2 3 3"]]:
-    """Return where the left and the right eye are [m] and how they are turned (x forward, y left, z up)."""
-    turned = rotation(pose)
-    offsets = jnp.asarray(_anatomy().eyes, turned.dtype)
-    return pose.position + offsets @ turned.T, jnp.broadcast_to(turned, (2, 3, 3))
+    """Return positions [m] and rotation matrices of the left and the right eye (x forward, y left, z up)."""
+    matrix = rotation(pose)
+    offsets = jnp.asarray(_anatomy().eyes, matrix.dtype)
+    return pose.position + offsets @ matrix.T, jnp.broadcast_to(matrix, (2, 3, 3))
 
 
 def laser_pose(pose: Pose) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return where the laser scanner is [m] and how it is turned."""
-    turned = rotation(pose)
-    return pose.position + turned @ jnp.asarray(_anatomy().laser, turned.dtype), turned
+    """Return position [m] and rotation matrix of the laser scanner."""
+    matrix = rotation(pose)
+    return pose.position + matrix @ jnp.asarray(_anatomy().laser, matrix.dtype), matrix
 
 
-def joints(data: mjx.Data) -> Float[Array, "6 3"]:
-    """Read the joint angles [rad]."""
+def joint_angles(data: mjx.Data) -> Float[Array, "6 3"]:
+    """Return the joint angles [rad], one row per leg as in `LEGS`."""
     return data.qpos[7:].reshape(6, 3)
 
 
-def feet(data: mjx.Data) -> Float[Array, "6 3"]:
-    """Read the centres of the feet [m] in the world, as they were at the start of the last substep."""
+def foot_positions(data: mjx.Data) -> Float[Array, "6 3"]:
+    """Return the centres of the feet [m, world], at the start of the last substep."""
     return data.geom_xpos[_anatomy().feet]
 
 
 def capsules(
     model: mjx.Model, data: mjx.Data
-) -> tuple[Float[Array, "shapes 3"], Float[Array, "shapes 3"], Float[Array, " shapes"]]:
-    """Read the capsules of trunk and legs that collide, as they were at the start of the last substep.
+) -> tuple[Float[Array, "capsules 3"], Float[Array, "capsules 3"], Float[Array, " capsules"]]:
+    """Return the capsules of trunk and legs that collide with obstacles, at the start of the last substep.
 
     Returns:
-        Both ends (13, 3) [m, world] and radii (13,) [m]: the trunk's, then femur and tibia of each leg.
+        Both ends (13, 3) [m, world] and radii (13,) [m], in the order of `CAPSULES`.
     """
     ids = _anatomy().capsules
     along = data.geom_xmat[ids].reshape(-1, 3, 3)[..., 2] * model.geom_size[ids, 1, None]
     return data.geom_xpos[ids] - along, data.geom_xpos[ids] + along, model.geom_size[ids, 0]
 
 
-def is_sound(data: mjx.Data) -> Bool[Array, ""]:
-    """Tell whether the state is finite and the robot on its feet: not fallen, on its belly or in the air."""
-    finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
-    upright = rotation(pose(data))[2, 2] > LEAST_UPRIGHT
+def is_healthy(data: mjx.Data) -> Bool[Array, ""]:
+    """Return whether the state is finite and the robot is on its feet: not fallen over, on its belly or in the air."""
+    is_finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
+    is_upright = rotation(pose(data))[2, 2] > MIN_UPRIGHT
     height = data.qpos[2]
-    return finite & upright & (height > LOWEST) & (height < HIGHEST)
+    return is_finite & is_upright & (height > MIN_TRUNK_HEIGHT) & (height < MAX_TRUNK_HEIGHT)

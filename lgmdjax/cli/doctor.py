@@ -1,4 +1,4 @@
-"""`lgmdjax doctor`: does this machine compute what it should? One line a check, OK, WARN or FAIL."""
+"""`lgmdjax doctor`: check whether this machine computes what it should; one line for each check, OK, WARN or FAIL."""
 
 import io
 import os
@@ -14,21 +14,25 @@ import numpy as np
 from packaging.requirements import Requirement
 
 OK, WARN, FAIL = "OK", "WARN", "FAIL"
-CANARY_ROWS = 32_769  # the smallest batch that shows jax#39103, one above a multiple of the tile
-STEP_TOLERANCE = 1e-4  # of MJX against C MuJoCo, float64, in any coordinate after one step
-FRAMES = 12
-ENOUGH_GB, LEAST_GB = 5.0, 0.5
+CANARY_ROWS = 32_769  # smallest batch that shows jax#39103: one more than a multiple of the tile
+STEP_TOLERANCE = 1e-4  # largest difference of MJX and C MuJoCo in any coordinate after one step in float64
+FRAMES = 12  # of the test video
+ENOUGH_GB, MIN_GB = 5.0, 0.5  # free disk space: less than the first is a WARN, than the second a FAIL
 
 
 class Finding(NamedTuple):
-    """What a check found."""
+    """The result of a check."""
 
     level: str
     text: str
 
 
-def examine(out: Path) -> int:
-    """Print one line a check; give the exit code, 1 if anything failed."""
+def run_checks(out: Path) -> int:
+    """Print one line for each check; return the exit code, 1 if any failed.
+
+    Args:
+        out: folder that run folders would be written to.
+    """
     checks: dict[str, Callable[[], Finding]] = {
         "python": python,
         "packages": packages,
@@ -39,62 +43,67 @@ def examine(out: Path) -> int:
         "disk": lambda: disk(out),
         "folder": lambda: folder(out),
     }
-    worst = 0
+    failed = False
     for name, check in checks.items():
         try:
-            found = check()
-        except Exception as error:  # a machine may fail in ways that nobody foresaw: say which, and go on
-            found = Finding(FAIL, f"{type(error).__name__}: {' '.join(str(error).split())[:300]}")
-        print(f"{found.level:4}  {name:10}  {found.text}", flush=True)
-        worst = max(worst, found.level == FAIL)
-    return int(worst)
+            finding = check()
+        except Exception as error:  # whatever else goes wrong on this machine is a finding too
+            finding = Finding(FAIL, f"{type(error).__name__}: {' '.join(str(error).split())[:300]}")
+        print(f"{finding.level:4}  {name:10}  {finding.text}", flush=True)
+        failed |= finding.level == FAIL
+    return int(failed)
 
 
 def python() -> Finding:
-    """Look at Python's version against the one range that pyproject.toml states."""
-    found = sys.version.split()[0]
-    good = (3, 11) <= sys.version_info[:2] <= (3, 13)
-    return Finding(OK if good else FAIL, f"{found}" if good else f"expected 3.11 to 3.13, found {found}")
+    """Check the version of Python against the range in pyproject.toml."""
+    installed = sys.version.split()[0]
+    if (3, 11) <= sys.version_info[:2] <= (3, 13):
+        return Finding(OK, installed)
+    return Finding(FAIL, f"expected 3.11 to 3.13, found {installed}; make a new environment with one of those")
 
 
 def packages() -> Finding:
-    """Look at every installed version against the ranges that this package was built with."""
+    """Check the version of every dependency against the range in this package's metadata."""
     try:
         wanted = [Requirement(line) for line in requires("lgmdjax") or ()]
     except PackageNotFoundError:
-        return Finding(WARN, "lgmdjax is not installed, so its ranges are not known; pip install -e .")
-    found, wrong = [], []
+        return Finding(
+            WARN,
+            "expected lgmdjax to be installed, found only its folder, so versions are not checked; pip install -e .",
+        )
+    accepted, wrong = [], []
     for requirement in wanted:
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         try:
-            have = version(requirement.name)
+            installed = version(requirement.name)
         except PackageNotFoundError:
-            have = "none"
-        fits = have != "none" and requirement.specifier.contains(have, prereleases=True)
-        (found if fits else wrong).append(
-            f"{requirement.name} {have}" + ("" if fits else f" (expected {requirement.specifier})")
-        )
+            wrong.append(f"{requirement.name} none (expected {requirement.specifier})")
+            continue
+        if requirement.specifier.contains(installed, prereleases=True):
+            accepted.append(f"{requirement.name} {installed}")
+        else:
+            wrong.append(f"{requirement.name} {installed} (expected {requirement.specifier})")
     if version("mujoco").split(".")[:2] != version("mujoco-mjx").split(".")[:2]:
-        wrong.append("mujoco and mujoco-mjx differ in their minor versions")
+        wrong.append("mujoco and mujoco-mjx of different minor versions")
     if wrong:
         return Finding(FAIL, f"{', '.join(wrong)}; install from requirements.lock")
-    return Finding(OK, ", ".join(found))
+    return Finding(OK, ", ".join(accepted))
 
 
 def devices() -> Finding:
-    """Name what JAX computes on, and whether a GPU lies idle."""
-    import jax  # here and below: what cannot be imported is a finding
+    """Name the devices that JAX computes on; warn about a GPU that it does not use."""
+    import jax  # inside each check, so that a package that cannot be imported is a finding
 
-    found = jax.devices()
-    text = ", ".join(str(device.device_kind) for device in found) + f"; {os.cpu_count()} cores"
-    if found[0].platform == "cpu" and shutil.which("nvidia-smi"):
-        return Finding(WARN, f"{text}; there is a GPU that JAX does not use: pip install 'lgmdjax[cuda13]'")
+    available = jax.devices()
+    text = ", ".join(str(device.device_kind) for device in available) + f"; {os.cpu_count()} cores"
+    if available[0].platform == "cpu" and shutil.which("nvidia-smi"):
+        return Finding(WARN, f"{text}; JAX does not use the GPU of this machine; pip install 'lgmdjax[cuda13]'")
     return Finding(OK, text)
 
 
 def arithmetic() -> Finding:
-    """Run the smallest program that some releases of JAX compile to wrong numbers (jax#39103)."""
+    """Run a small program that some releases of JAX compile to wrong numbers (jax#39103)."""
     import jax
     import jax.numpy as jnp
 
@@ -105,78 +114,79 @@ def arithmetic() -> Finding:
     if wrong:
         return Finding(
             FAIL,
-            f"{wrong} of {CANARY_ROWS} results wrong under jit: install another jax (see pyproject.toml)",
+            f"{wrong} of {CANARY_ROWS} results wrong under jit; install another release of jax (see pyproject.toml)",
         )
     return Finding(OK, f"{CANARY_ROWS} results right under jit in float64")
 
 
 def physics() -> Finding:
-    """Take one step with the kicked hexapod in MJX and in C MuJoCo."""
+    """Compare one physics step of the hexapod, from random velocities, in MJX and in C MuJoCo."""
     import jax
     import jax.numpy as jnp
     import mujoco
 
-    from lgmdjax.runtime.jax_setup import import_physics
-
-    import_physics()
-    from mujoco import mjx
-
     from lgmdjax.body import hexapod
+    from lgmdjax.runtime.mjx import mjx
 
     model = hexapod.load()
-    there = mujoco.MjData(model)
+    reference = mujoco.MjData(model)
     if model.nkey:
-        mujoco.mj_resetDataKeyframe(model, there, 0)
-    there.qvel[:] = np.random.default_rng(0).normal(size=model.nv) * 0.3
+        mujoco.mj_resetDataKeyframe(model, reference, 0)
+    reference.qvel[:] = np.random.default_rng(0).normal(size=model.nv) * 0.3
     with jax.enable_x64(True):
-        built = mjx.put_model(model, impl="jax")
+        mjx_model = mjx.put_model(model, impl="jax")
         # Copies: asarray may share MuJoCo's buffers, which mj_step writes to while JAX still reads them.
-        here = mjx.make_data(built).replace(
-            qpos=jnp.array(there.qpos), qvel=jnp.array(there.qvel), ctrl=jnp.array(there.ctrl)
+        data = mjx.make_data(mjx_model).replace(
+            qpos=jnp.array(reference.qpos), qvel=jnp.array(reference.qvel), ctrl=jnp.array(reference.ctrl)
         )
-        here = jax.jit(mjx.step)(built, here)
-    mujoco.mj_step(model, there)
-    gaps = [np.asarray(here.qpos) - there.qpos, np.asarray(here.qvel) - there.qvel]
-    off = float(np.max(np.abs(np.concatenate(gaps))))
-    level = OK if off < STEP_TOLERANCE else FAIL
-    return Finding(level, f"one step of the hexapod, MJX and C MuJoCo {off:.1e} apart")
+        data = jax.jit(mjx.step)(mjx_model, data)
+    mujoco.mj_step(model, reference)
+    differences = [np.asarray(data.qpos) - reference.qpos, np.asarray(data.qvel) - reference.qvel]
+    largest = float(np.max(np.abs(np.concatenate(differences))))
+    text = f"after one step of the hexapod MJX and C MuJoCo differ by {largest:.1e}"
+    if largest < STEP_TOLERANCE:
+        return Finding(OK, text)
+    return Finding(FAIL, f"{text}, expected less than {STEP_TOLERANCE:g}; install mujoco from requirements.lock")
 
 
 def video_codec() -> Finding:
-    """Encode a few frames with H.264 in memory, and count them again."""
+    """Encode a few frames with H.264 in memory, decode them, and count them."""
     import av
 
     from lgmdjax.reporting import video_io
 
     file = io.BytesIO()
-    with video_io.writing(file, 64, 48, 30) as write:
+    with video_io.open_writer(file, 64, 48, 30) as write:
         for shade in range(FRAMES):
             write(np.full((48, 64, 3), 20 * shade, np.uint8))
     file.seek(0)
     with av.open(file, "r") as container:
         stream = container.streams.video[0]
-        codec, found = stream.codec_context.name, sum(1 for _ in container.decode(stream))
-    return Finding(OK if found == FRAMES else FAIL, f"{codec}: {found} of {FRAMES} frames came back from H.264")
+        codec, decoded = stream.codec_context.name, sum(1 for _ in container.decode(stream))
+    return Finding(OK if decoded == FRAMES else FAIL, f"{codec}: {decoded} of {FRAMES} frames encoded and decoded")
 
 
 def disk(out: Path) -> Finding:
-    """Look for room for a run."""
-    free = shutil.disk_usage(_nearest(out)).free / 1e9
-    level = OK if free >= ENOUGH_GB else WARN if free >= LEAST_GB else FAIL
-    return Finding(level, f"{free:.1f} GB free for {out}" + ("" if level == OK else f"; {ENOUGH_GB:g} GB are enough"))
+    """Check that the disk has space for a run."""
+    free = shutil.disk_usage(_existing_parent(out)).free / 1e9
+    level = OK if free >= ENOUGH_GB else WARN if free >= MIN_GB else FAIL
+    advice = "" if level == OK else f"; {ENOUGH_GB:g} GB are enough: free some, or choose another --out"
+    return Finding(level, f"{free:.1f} GB free for {out}{advice}")
 
 
 def folder(out: Path) -> Finding:
-    """Try to write where runs go."""
-    place = _nearest(out)
+    """Check that files can be written to the folder, or to the one that it would be made in."""
+    parent = _existing_parent(out)
     try:
-        with tempfile.TemporaryFile(dir=place):
-            return Finding(OK, f"{place.resolve()} can be written")
+        with tempfile.TemporaryFile(dir=parent):
+            return Finding(OK, f"{parent.resolve()} can be written")
     except OSError as error:
-        return Finding(FAIL, f"expected a folder that can be written, got {place} ({error.strerror}); choose --out")
+        return Finding(
+            FAIL, f"expected a folder that can be written, got {parent} ({error.strerror}); choose another --out"
+        )
 
 
-def _nearest(path: Path) -> Path:
-    """Find the folder itself, or the one that it would be made in."""
+def _existing_parent(path: Path) -> Path:
+    """Return the path itself if it exists, otherwise its nearest parent that does."""
     path = path.absolute()
-    return next(place for place in (path, *path.parents) if place.exists())
+    return next(folder for folder in (path, *path.parents) if folder.exists())

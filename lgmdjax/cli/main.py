@@ -1,157 +1,97 @@
-"""The command line: one function a subcommand, whose arguments are its flags.
+"""The command line: one function for each command, which reads its own flags.
 
-What a user can get wrong ends in one line on stderr and exit code 2; an interruption in 130.
+A user's mistake ends in one line on stderr and exit code 2, an interruption in exit code 130. Modules are imported by
+the command that needs them: `lgmdjax --help` loads neither tyro nor JAX, and the help of a command loads no JAX.
 """
 
+import argparse
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from inspect import getdoc
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
 
 from lgmdjax import __version__
 from lgmdjax.errors import InputError
-from lgmdjax.pipeline.scales import SCALES, Scale
-from lgmdjax.runtime.jax_setup import import_physics, prepare_jax
+from lgmdjax.runtime.jax_setup import prepare_jax
+
+DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pipeline:
-    """Which run folder, and what it is made with."""
-
-    scale: Scale = "quick"
-    """smoke goes through every stage in minutes, quick shows the result, paper uses the paper's figures"""
-    out: Path = Path("runs")
-    """folder of the run folders"""
-    seed: int = 0
-    """seed of everything that is drawn at random"""
-    name: str = ""
-    """name of the run folder; <scale>-<seed> if empty"""
+def reproduce(arguments: Sequence[str]) -> None:
+    """Fit the gait, collect, train, evaluate and report; finished stages are skipped."""
+    print(f"open {_run_stages('report', arguments, reproduce) / 'index.html'}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Attempts:
-    """Flags of whoever walks experiments of the paper."""
-
-    seed: int = 0
-    """of rooms, textures and starts"""
-    seeds: int | None = None
-    """how many times; as many as the paper has, or more, if left out"""
-    width: int | None = None
-    """of the pictures [px], 320 as in the paper; as it learned with, which says nearly the same, if left out"""
-    run: Path | None = None
-    """folder of the run whose robot walks; the trained one that comes along if left out"""
-    out: Path = Path("runs/trials")
-    """the results go into a folder a trial and driver in here"""
+def fit_gait(arguments: Sequence[str]) -> None:
+    """Fit the shaping networks to the regular tripod gait."""
+    _run_stages("fit-gait", arguments, fit_gait)
 
 
-Name = Literal["testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "white", "corner"]
-Who = Literal["teacher", "learned", "blind", "direct", "random"]
-Flags = Annotated[Pipeline, tyro.conf.arg(name="")]
-AttemptFlags = Annotated[Attempts, tyro.conf.arg(name="")]
+def collect(arguments: Sequence[str]) -> None:
+    """Record walks of the teacher in training rooms, after the stages that this one needs."""
+    _run_stages("collect", arguments, collect)
 
 
-def reproduce(pipeline: Flags) -> None:
-    """Fit the gait, collect, train, evaluate, and leave a report; what is done already is skipped."""
-    print(f"open {_execute(pipeline, 'report') / 'index.html'}")
+def train(arguments: Sequence[str]) -> None:
+    """Train the navigator on recorded walks, after the stages that this one needs."""
+    _run_stages("train", arguments, train)
 
 
-def fit_gait(pipeline: Flags) -> None:
-    """Teach the shaping networks the regular tripod gait."""
-    _execute(pipeline, "fit-gait")
+def evaluate(arguments: Sequence[str]) -> None:
+    """Run all policies in the trials, after the stages that this one needs."""
+    _run_stages("evaluate", arguments, evaluate)
 
 
-def collect(pipeline: Flags) -> None:
-    """Record the teacher's walks in training rooms (and the gait before, if it is not there)."""
-    _execute(pipeline, "collect")
+def report(arguments: Sequence[str]) -> None:
+    """Write the report page, after the stages that this one needs."""
+    print(f"open {_run_stages('report', arguments, report) / 'index.html'}")
 
 
-def train(pipeline: Flags) -> None:
-    """Fit the navigator to the recorded walks (and what they need, if it is not there)."""
-    _execute(pipeline, "train")
+def trial(arguments: Sequence[str]) -> None:
+    """Run policies in trials of the paper: outcome, walks, plot of the paths, video."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse_trial(_summary(trial), arguments)
+    from lgmdjax.cli.trial import run_trials
+
+    for line in run_trials(given):
+        print(line, flush=True)
 
 
-def evaluate(pipeline: Flags) -> None:
-    """Walk all drivers in the paper's experiments and in unseen rooms (and do the stages before, if need be)."""
-    _execute(pipeline, "evaluate")
+def study(arguments: Sequence[str]) -> None:
+    """Answer a question about the robot with a table and a figure."""
+    word = [word if word.startswith("-") else word.replace("-", "_") for word in arguments[:1]]
+    name = _choose("lgmdjax study", "STUDY", _summary(study), STUDIES, word)
+    from lgmdjax.cli import flags
+
+    given = flags.parse_study(name, STUDIES[name], arguments[1:])
+    from lgmdjax.cli.study import run_study
+
+    print(f"look into {run_study(name, given)}")
 
 
-def report(pipeline: Flags) -> None:
-    """Write the report page (and do the stages before, if they are not there)."""
-    print(f"open {_execute(pipeline, 'report') / 'index.html'}")
+def watch(arguments: Sequence[str]) -> None:
+    """Run the two looming detectors on a video: responses of each frame, plot, overlay video."""
+    from lgmdjax.cli import flags
 
+    given = flags.parse_watch(_summary(watch), arguments)
+    from lgmdjax.cli.watch import watch_video
 
-def doctor(*, out: Path = Path("runs")) -> int:
-    """Check this machine: versions, devices, arithmetic, physics, video, disk; exit code 1 on a FAIL.
-
-    Args:
-        out: the folder that runs would be written to
-    """
-    from lgmdjax.cli.doctor import examine
-
-    return examine(out)
-
-
-def watch(
-    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="video")],
-    *,
-    stereo: Literal["side-by-side"] | None = None,
-    mono: tyro.conf.FlagCreatePairsOff[bool] = False,
-    out: Path = Path("runs/watch"),
-    table: Literal["csv", "parquet"] = "csv",
-    overlap: float = 0.5,
-    width: int = 320,
-    threshold: float | None = None,
-    suppression: float | None = None,
-    inhibition: float | None = None,
-) -> None:
-    """Run the two collision detectors on a video; leave u and FF of each frame, a plot and an overlay video.
-
-    Args:
-        path: the video; anything that FFmpeg reads
-        stereo: each frame holds the left and the right eye's picture, side by side
-        mono: each frame is one picture, and each eye looks at its side of it (so it is without --stereo)
-        out: the results go into a folder of the video's name in here
-        table: format of the numbers, one row a frame
-        overlap: fraction of its picture that each eye looks at, 0.5 (its half) to 1 (all of it)
-        width: pictures that are wider are averaged down to this [px]
-        threshold: T_s, the change that a cell must exceed [grey levels of 255]
-        suppression: T_f, the mean change over the picture at which the detector is silenced [grey levels]
-        inhibition: W_I, weight of the inhibition
-    """
-    from lgmdjax.cli import watch as watching
-    from lgmdjax.detectors import lgmd
-
-    if mono and stereo is not None:
-        raise InputError("expected --mono or --stereo, got both; leave one out")
-    chosen = {"threshold": threshold, "suppression": suppression, "inhibition": inhibition}
-    params = replace(lgmd.Params(), **{name: value for name, value in chosen.items() if value is not None})
-    eyes = watching.Eyes(stereo=stereo is not None, overlap=overlap, width=width)
-    for file in watching.watch(path, out, eyes=eyes, params=params, table=table):
+    for file in watch_video(given):
         print(file)
 
 
-def trial(
-    name: Annotated[Name, tyro.conf.Positional],
-    *,
-    driver: Who = "learned",
-    attempts: AttemptFlags,
-) -> None:
-    """Walk one of the paper's experiments; leave the outcome, the walks, a picture from above and a film.
+def doctor(arguments: Sequence[str]) -> int:
+    """Check this machine: versions, devices, arithmetic, physics, video, disk; exit code 1 after a FAIL."""
+    from lgmdjax.cli import flags
 
-    Args:
-        name: of the experiment
-        driver: who walks
-    """
-    import_physics()
-    from lgmdjax.evaluation.run_trial import attempt
+    given = flags.parse(flags.DoctorFlags(), "doctor", _summary(doctor), arguments)
+    from lgmdjax.cli.doctor import run_checks
 
-    print(f"look into {attempt(name, driver, **vars(attempts))}")
+    return run_checks(given.out)
 
 
-COMMANDS: dict[str, Callable[..., int | None]] = {
+COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "reproduce": reproduce,
     "fit-gait": fit_gait,
     "collect": collect,
@@ -159,43 +99,80 @@ COMMANDS: dict[str, Callable[..., int | None]] = {
     "evaluate": evaluate,
     "report": report,
     "trial": trial,
+    "study": study,
     "watch": watch,
     "doctor": doctor,
 }
 
+STUDIES: Mapping[str, str] = {
+    "velocity": "How fast should the robot walk for its detectors? (fig. 9)",
+    "supervision": "Which rule should teach, and which network should learn? (sec. 3.4 and 4.2)",
+    "errata": "What do the equations do that cannot work as printed?",
+    "failure_modes": "How often do a white wall and a corner stop the robot, and what helps? (sec. 5.4)",
+    "sensitivity": "How far may camera, rooms, legs and data be from those of the training?",
+    "overlap": "How much of its picture should each detector see?",
+    "gait_gradient": "Can the gait be fitted by gradient through the physics?",
+    "lgmd_gradient": "Does a detector that is fitted by gradient steer better than the calibrated one?",
+    "gradient_horizon": "Over how many frames is a gradient through the closed loop meaningful?",
+    "closed_loop_finetune": "Does the gradient through the closed loop teach what imitation cannot?",
+}
+"""The studies of `lgmdjax.studies`, and the question of each."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; give the exit code."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if list(arguments) == ["--version"]:
-        print(f"lgmdjax {__version__}")
-        return 0
+    """Run one command and return the exit code."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    summaries = {name: _summary(command) for name, command in COMMANDS.items()}
+    name = _choose("lgmdjax", "COMMAND", DESCRIPTION, summaries, given[:1])
     prepare_jax()
-    return guarded(
-        lambda: tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="lgmdjax", args=arguments, description="A hexapod with the eyes of a locust."
-        )
-    )
+    return exit_code(lambda: COMMANDS[name](given[1:]))
 
 
-def guarded(command: Callable[[], int | None]) -> int:
-    """Run a command; give its exit code, after a line on stderr where the user can mend it."""
+def exit_code(command: Callable[[], int | None]) -> int:
+    """Run a command and return its exit code; print one line on stderr for a mistake of the user."""
     try:
         return command() or 0
     except (InputError, OSError) as error:
         print(f"lgmdjax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("lgmdjax: interrupted; the same command carries on", file=sys.stderr)
+        print("lgmdjax: interrupted; the same command resumes", file=sys.stderr)
         return 130
 
 
-def _execute(pipeline: Pipeline, target: str) -> Path:
+def _choose(program: str, noun: str, description: str, choices: Mapping[str, str], word: Sequence[str]) -> str:
+    """Return the choice that a word names; exit with help or an error if there is no such word."""
+    column = max(map(len, choices))
+    listed = "\n".join(f"  {name:{column}}  {summary}" for name, summary in choices.items())
+    parser = argparse.ArgumentParser(
+        prog=program,
+        usage=f"{program} {noun} [flags]",
+        description=description,
+        epilog=f"{noun} is one of\n{listed}\n\n`{program} {noun} --help` lists the flags.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"lgmdjax {__version__}", help="show the version and exit"
+    )
+    parser.add_argument("name", metavar=noun, choices=choices, help=argparse.SUPPRESS)
+    return parser.parse_args(word).name
+
+
+def _summary(command: Callable[[Sequence[str]], int | None]) -> str:
+    """Return the first line of a command's docstring, which is its help."""
+    return (getdoc(command) or "").partition("\n")[0]
+
+
+def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequence[str]], None]) -> Path:
+    """Run the stages up to a target in the run folder of the flags; return the folder of the target."""
+    from lgmdjax.cli import flags
+
+    name = command.__name__.replace("_", "-")
+    given = flags.parse_pipeline(name, _summary(command), arguments)
     from lgmdjax.runtime.run_folders import execute, open_run
 
-    name = pipeline.name or f"{pipeline.scale}-{pipeline.seed}"
-    run = open_run(pipeline.out, name, pipeline.scale, pipeline.seed, SCALES[pipeline.scale])
-    import_physics()
+    run = open_run(given.out, given.name, given.scale, given.seed, given.settings)
     from lgmdjax.pipeline.stages import STAGES
 
     return execute(run, STAGES, target)

@@ -1,12 +1,17 @@
-"""`lgmdjax watch`: the two LGMDs on a video of the user's, read and written a frame at a time.
+"""`lgmdjax watch`: the two LGMDs on a video of the user, read and written frame by frame.
 
-Leaves, in a folder of the video's full name: `response.csv` (or `.parquet`), one row a frame; `response.png`, the
-same as a plot; `overlay.mp4`, what the eyes see with the layers E, I and S and the course of u.
+Writes to a folder with the full name of the video:
+
+| file                          | content                                                            |
+| ----------------------------- | ------------------------------------------------------------------ |
+| response.csv or .parquet      | the responses, one row for each frame                              |
+| response.png                  | plot of the responses over time                                    |
+| overlay.mp4                   | the pictures of both eyes, the layers E, I and S, and u over time  |
 """
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -23,6 +28,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from lgmdjax import __version__
+from lgmdjax.cli.flags import WatchFlags
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import lgmd_overlay, video_io
@@ -30,11 +36,12 @@ from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
 from lgmdjax.sensors import hemifield
 
-LEAST_FRAMES = 3  # inhibition, a frame late, has not been felt before the third
-SMALLEST = 16  # px, of an eye's picture either way
-TUNED_RATE = 30  # Hz, of the robot's cameras
+MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third is the first with all of it
+MIN_SIZE = 16  # px, smallest width and height of the picture of an eye
+NOMINAL_RATE = 30  # Hz, of the robot's cameras
 SIDES = ("left", "right")
-Table = Literal["csv", "parquet"]
+CONSTANTS = ("threshold", "suppression", "inhibition")  # of the detector, which the command line can change
+TableFormat = Literal["csv", "parquet"]
 UNITS = {
     "time": "s",
     "u": "1, from 0.5 (still) to 1",
@@ -44,60 +51,71 @@ UNITS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eyes:
-    """How the pictures of a video become those of two eyes."""
+class StereoLayout:
+    """How the pictures of both eyes are cut out of the frames of a video."""
 
-    stereo: bool = False  # each frame holds two pictures side by side
-    overlap: float = 0.5  # fraction of its picture's width that an eye looks at, from its own side
+    stereo: bool = False  # each frame holds two pictures, side by side
+    overlap: float = 0.5  # fraction of the picture's width that an eye sees, from its own side
     width: int = 320  # px of one picture; wider ones are averaged down to it
 
 
-def watch(
+def watch_video(flags: WatchFlags) -> list[Path]:
+    """Run both detectors on the video of the flags, and return the written files."""
+    if flags.mono and flags.stereo is not None:
+        raise InputError("expected --mono or --stereo, got both; leave one out")
+    given = {name: getattr(flags, name) for name in CONSTANTS}
+    params = replace(lgmd.Params(), **{name: value for name, value in given.items() if value is not None})
+    layout = StereoLayout(stereo=flags.stereo is not None, overlap=flags.overlap, width=flags.width)
+    return detect_looming(flags.video, flags.out, layout=layout, params=params, table=flags.table)
+
+
+def detect_looming(
     path: Path,
     out: Path,
     *,
-    eyes: Eyes,
+    layout: StereoLayout,
     params: lgmd.Params,
-    table: Table = "csv",
+    table: TableFormat = "csv",
 ) -> list[Path]:
-    """Run both detectors over a video; give the files written into out/<name of the video>/.
+    """Run both detectors on a video, and return the files written to out/<name of the video>/.
 
-    Raises InputError when the video is missing, damaged, too short, or does not fit the eyes; nothing is then
-    written.
+    Raises InputError, and writes nothing, if the video is missing, damaged, too short, or does not fit the layout.
     """
     lgmd.check(params)
-    place = out / path.name
-    with video_io.reading(path) as film:
-        width, height = _scaled(path, film, eyes)
-        _note_rate(film)
-        sheet = lgmd_overlay.lay_out(*_split(np.zeros((height, width), np.uint8), eyes).shape[1:])
-        with storage.all_or_nothing(place) as folder, _progress(film, width, height) as frames:
-            course, excitations = _look_at_all(frames, sheet, folder / "overlay.mp4", film.rate, eyes, params)
-            if len(course) < LEAST_FRAMES:
+    folder = out / path.name
+    with video_io.open_reader(path) as video:
+        width, height = _scaled_size(path, video, layout)
+        _warn_about_rate(video)
+        overlay = lgmd_overlay.make_layout(*_split(np.zeros((height, width), np.uint8), layout).shape[1:])
+        with storage.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
+            samples, excitations = _process(
+                frames, layout, params, overlay=overlay, target=partial_folder / "overlay.mp4", rate=video.rate
+            )
+            if len(samples) < MIN_FRAMES:
                 raise InputError(
-                    f"expected a video of {LEAST_FRAMES} frames or more, got {len(course)} in {path}; take a longer one"
+                    f"expected a video of {MIN_FRAMES} frames or more, got {len(samples)} in {path}; take a longer one"
                 )
-            responses = _table(course, excitations, _metadata(path, film, eyes, params))
+            responses = _table(samples, excitations, _metadata(path, video, layout, params))
             if table == "csv":
-                pyarrow.csv.write_csv(responses, folder / "response.csv")
+                pyarrow.csv.write_csv(responses, partial_folder / "response.csv")
             else:
-                pyarrow.parquet.write_table(responses, folder / "response.parquet")
-            (folder / "response.png").write_bytes(style.to_png(plot(responses, params)))
-    for other in set(get_args(Table)) - {table}:  # of an earlier time
-        (place / f"response.{other}").unlink(missing_ok=True)
-    return [place / name for name in (f"response.{table}", "response.png", "overlay.mp4")]
+                pyarrow.parquet.write_table(responses, partial_folder / "response.parquet")
+            (partial_folder / "response.png").write_bytes(style.to_png(plot(responses, params)))
+    for other in set(get_args(TableFormat)) - {table}:  # of an earlier call
+        (folder / f"response.{other}").unlink(missing_ok=True)
+    return [folder / name for name in (f"response.{table}", "response.png", "overlay.mp4")]
 
 
 @style.styled
 def plot(responses: pa.Table, params: lgmd.Params) -> Figure:
-    """Draw u and FF of both eyes over time, FF with the level T_f at which it silences u."""
+    """Plot u and FF of both eyes over time, with the threshold T_f above which FF suppresses u."""
     figure = Figure(figsize=(style.WIDTH, 3.4))
     upper, lower = figure.subplots(2, 1, sharex=True)
     time = responses["time"].to_numpy()
-    for side, colour in zip(SIDES, (style.LEFT, style.RIGHT), strict=True):
+    for side, colour in zip(SIDES, (style.LEFT_COLOUR, style.RIGHT_COLOUR), strict=True):
         upper.plot(time, responses[f"u_{side}"].to_numpy(), color=colour, label=f"{side} eye")
         lower.plot(time, responses[f"feed_forward_{side}"].to_numpy(), color=colour)
-    lower.axhline(float(params.suppression), color=style.QUIET, linestyle=":", label="T_f")
+    lower.axhline(float(params.suppression), color=style.GREY, linestyle=":", label="T_f")
     upper.set(ylabel="u", ylim=(0.48, 1.02), title="response of the two LGMDs")
     lower.set(ylabel="FF [grey levels]", xlabel="time [s]")
     upper.legend(loc="upper left", ncols=2)
@@ -105,87 +123,91 @@ def plot(responses: pa.Table, params: lgmd.Params) -> Figure:
     return figure
 
 
-def _note_rate(film: video_io.Video) -> None:
-    rate = float(film.rate)
-    if not 0.8 < rate / TUNED_RATE < 1.25:
-        print(f"note: {rate:.3g} frames a second; T_s and T_f are meant for the changes of 1/{TUNED_RATE} s")
+def _warn_about_rate(video: video_io.Video) -> None:
+    rate = float(video.rate)
+    if not 0.8 < rate / NOMINAL_RATE < 1.25:
+        print(f"note: {rate:.3g} frames a second; T_s and T_f are meant for the changes of 1/{NOMINAL_RATE} s")
 
 
-def _progress(film: video_io.Video, width: int, height: int) -> tqdm:
-    return tqdm(film.frames(width, height), total=film.count or None, unit="frame", desc="watch")
+def _progress(video: video_io.Video, width: int, height: int) -> tqdm:
+    return tqdm(video.frames(width, height), total=video.count or None, unit="frame", desc="watch")
 
 
-def _scaled(path: Path, film: video_io.Video, eyes: Eyes) -> tuple[int, int]:
-    """The size to read the video at, so that an eye's picture is at most `eyes.width` wide."""
-    if eyes.stereo and film.width % 2:
+def _scaled_size(path: Path, video: video_io.Video, layout: StereoLayout) -> tuple[int, int]:
+    """Return the size at which the video is read, so that the picture of an eye is at most `layout.width` wide."""
+    if layout.stereo and video.width % 2:
         raise InputError(
-            f"expected an even width for two pictures side by side, got {film.width} px in {path}; "
-            "crop the video, or watch it with --mono"
+            f"expected an even width for two pictures side by side, got {video.width} px in {path}; "
+            "crop the video, or use --mono"
         )
-    pictures = 2 if eyes.stereo else 1
-    own = film.width // pictures
-    width = min(eyes.width, own)
-    height = round(film.height * width / own)
-    if min(width, height) < SMALLEST:
+    pictures = 2 if layout.stereo else 1
+    full_width = video.width // pictures
+    width = min(layout.width, full_width)
+    height = round(video.height * width / full_width)
+    if min(width, height) < MIN_SIZE:
         raise InputError(
-            f"expected pictures of {SMALLEST} px or more either way, got {width} x {height} from {path}; "
+            f"expected pictures of {MIN_SIZE} px or more either way, got {width} x {height} from {path}; "
             "raise --width, or give a larger video"
         )
     return pictures * width, height
 
 
-def _split(picture: UInt8[np.ndarray, "height width"], eyes: Eyes) -> Float[np.ndarray, "2 height eye"]:
-    """Cut one frame into what the two eyes look at."""
-    both = np.split(picture, 2, axis=1) if eyes.stereo else [picture, picture]
-    cut = [hemifield.hemifield(own, side, eyes.overlap) for side, own in enumerate(both)]
-    return np.stack(cut).astype(jnp.result_type(float))
+def _split(picture: UInt8[np.ndarray, "height width"], layout: StereoLayout) -> Float[np.ndarray, "2 height eye"]:
+    """Cut the pictures of both eyes out of one frame."""
+    pictures = np.split(picture, 2, axis=1) if layout.stereo else [picture, picture]
+    crops = [hemifield.crop(whole, side, layout.overlap) for side, whole in enumerate(pictures)]
+    return np.stack(crops).astype(jnp.result_type(float))
 
 
 @jax.jit
-def _open(params: lgmd.Params, pictures: Float[Array, "2 height eye"]) -> lgmd.State:
+def _init(params: lgmd.Params, pictures: Float[Array, "2 height eye"]) -> lgmd.State:
     return jax.vmap(partial(lgmd.init, params))(pictures)
 
 
 @jax.jit
-def _look(
+def _step(
     params: lgmd.Params, states: lgmd.State, pictures: Float[Array, "2 height eye"]
 ) -> tuple[lgmd.State, lgmd.Response, lgmd.Layers]:
     layers = jax.vmap(partial(lgmd.layers, params))(states, pictures)
     return *jax.vmap(partial(lgmd.step, params))(states, pictures), layers
 
 
-def _look_at_all(
-    frames: tqdm,
-    sheet: lgmd_overlay.Sheet,
+def _process(
+    frames: Iterable[video_io.Frame],
+    layout: StereoLayout,
+    params: lgmd.Params,
+    *,
+    overlay: lgmd_overlay.Layout,
     target: Path,
     rate: Fraction,
-    eyes: Eyes,
-    params: lgmd.Params,
-) -> tuple[list[lgmd_overlay.Moment], list[tuple[float, float]]]:
-    """Run the detectors over the frames, drawing on the way; what they say of each, and their excitations."""
-    course: list[lgmd_overlay.Moment] = []
+) -> tuple[list[lgmd_overlay.ResponseSample], list[tuple[float, float]]]:
+    """Run the detectors over the frames and write the overlay video; return responses and excitations of each frame."""
+    samples: list[lgmd_overlay.ResponseSample] = []
     excitations: list[tuple[float, float]] = []
-    with video_io.writing(target, *sheet.paper.size, rate) as write:
-        for moment, excitation, pictures, layers in _responses(frames, eyes, params):
-            course.append(moment)
+    with video_io.open_writer(target, *overlay.background.size, rate) as write:
+        for sample, excitation, pictures, layers in _respond(frames, layout, params):
+            samples.append(sample)
             excitations.append(excitation)
-            write(lgmd_overlay.draw(sheet, pictures, layers, float(params.threshold), course))
-    return course, excitations
+            write(lgmd_overlay.render_overlay(overlay, pictures, layers, float(params.threshold), samples))
+    return samples, excitations
 
 
-def _responses(
-    frames: Iterable[video_io.Frame], eyes: Eyes, params: lgmd.Params
-) -> Iterator[tuple[lgmd_overlay.Moment, tuple[float, float], np.ndarray, lgmd.Layers]]:
-    """Show every frame to both eyes; the first one twice, so that nothing has changed in it."""
+def _respond(
+    frames: Iterable[video_io.Frame], layout: StereoLayout, params: lgmd.Params
+) -> Iterator[tuple[lgmd_overlay.ResponseSample, tuple[float, float], np.ndarray, lgmd.Layers]]:
+    """Yield responses, excitations, pictures and layers of each frame.
+
+    The detectors start from the first frame, so that nothing has changed in it.
+    """
     states = None
     for frame in frames:
-        pictures = _split(frame.picture, eyes)
-        states = _open(params, jnp.asarray(pictures)) if states is None else states
-        states, response, layers = _look(params, states, jnp.asarray(pictures))
+        pictures = _split(frame.picture, layout)
+        states = _init(params, jnp.asarray(pictures)) if states is None else states
+        states, response, layers = _step(params, states, jnp.asarray(pictures))
         u, feed_forward, excitation = (
             _pair(value) for value in (response.u, response.feed_forward, response.excitation)
         )
-        yield lgmd_overlay.Moment(frame.time, u, feed_forward), excitation, pictures, layers
+        yield lgmd_overlay.ResponseSample(frame.time, u, feed_forward), excitation, pictures, layers
 
 
 def _pair(values: Array) -> tuple[float, float]:
@@ -194,18 +216,18 @@ def _pair(values: Array) -> tuple[float, float]:
 
 
 def _table(
-    course: list[lgmd_overlay.Moment], excitations: list[tuple[float, float]], metadata: dict[str, str]
+    samples: list[lgmd_overlay.ResponseSample], excitations: list[tuple[float, float]], metadata: dict[str, str]
 ) -> pa.Table:
-    """Put the responses into columns, one row a frame."""
-    columns: dict[str, object] = {"frame": range(len(course)), "time": [moment.time for moment in course]}
+    """Return the responses as a table with one row for each frame."""
+    columns: dict[str, object] = {"frame": range(len(samples)), "time": [sample.time for sample in samples]}
     for side, name in enumerate(SIDES):
-        columns[f"u_{name}"] = [moment.u[side] for moment in course]
-        columns[f"feed_forward_{name}"] = [moment.feed_forward[side] for moment in course]
+        columns[f"u_{name}"] = [sample.u[side] for sample in samples]
+        columns[f"feed_forward_{name}"] = [sample.feed_forward[side] for sample in samples]
         columns[f"excitation_{name}"] = [pair[side] for pair in excitations]
     return pa.table({name: pa.array(values) for name, values in columns.items()}, metadata=metadata)
 
 
-def _metadata(path: Path, film: video_io.Video, eyes: Eyes, params: lgmd.Params) -> dict[str, str]:
-    numbers = {name: float(getattr(params, name)) for name in ("threshold", "suppression", "inhibition")}
-    facts = {"units": UNITS, "eyes": asdict(eyes), "lgmd": numbers, "rate": float(film.rate)}
+def _metadata(path: Path, video: video_io.Video, layout: StereoLayout, params: lgmd.Params) -> dict[str, str]:
+    constants = {name: float(getattr(params, name)) for name in CONSTANTS}
+    facts = {"units": UNITS, "eyes": asdict(layout), "lgmd": constants, "rate": float(video.rate)}
     return {"video": path.name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}

@@ -1,7 +1,7 @@
-"""Braitenberg's vehicles, and the rule made of two of them that teaches the robot to walk around things.
+"""Braitenberg vehicles, and the teacher: the obstacle avoidance rule made of two of them (eqs. 18-22).
 
-Two sensors drive two sides of the body, straight or crossed, exciting or inhibiting. The teacher feeds the
-nearness 1/d of the nearest obstacle in either hemifield to the sum of vehicles 2a and 3b (eq. 22).
+Two sensors drive the two sides of the body, straight or crossed, exciting or inhibiting. The teacher feeds the
+nearness 1/d of the nearest obstacle in each hemifield to the sum of vehicles 2a and 3b (eq. 22).
 
 | symbol     | name                  | unit              | equation |
 | ---------- | --------------------- | ----------------- | -------- |
@@ -14,17 +14,24 @@ nearness 1/d of the nearest obstacle in either hemifield to the sum of vehicles 
 
 Source: Cizek & Faigl, sec. 4.1, 4.2; Braitenberg 1986. Pairs are (left, right); v_right > v_left turns left.
 
-Eq. 22 as printed is `rule`. It asks for velocities that no gait can make, and straight in front of a flat
-wall it walks on, faster and faster, because both sides are equally near. `step` therefore departs from it
-twice: it keeps to the gait's range in the way that saves most of the turn (`limit`), and when something is
-near it turns at least so much, and goes on turning the way it turns while both sides are nearly equally near.
+`rule` is eq. 22 as printed. It commands velocities that no gait can reach. In front of a flat wall both sides are
+equally near, so it accelerates into the wall. `step` therefore departs from it in two ways:
 
-As it is, 16 robots, a minute each in `scenes.training_room`, kept 0.22 m off everything in 52 m
-(`tests/test_teacher.py` does it with eight); there eq. 22 within the gait's range touched something 17 times in 66 m,
-and a blind robot 24 times in 58 m. It is `full_turn` that keeps the robot off; the tie-break, without which nothing
-was touched there either, makes the labels ones that can be learned: the same sight, the same turn.
+1. `limit` brings the velocity into the range of the gait and keeps as much of the turn as possible.
+2. Near an obstacle the turn has a minimum size, and while both sides are nearly equally near, its direction is kept.
 
-Gradient: exact almost everywhere; the side of the turn has none.
+Robots of one minute each in `scenes.training_room` (`tests/test_teacher.py` repeats the first row with eight robots):
+
+| rule                       | walked | contacts                |
+| -------------------------- | ------ | ----------------------- |
+| teacher, 16 robots         | 52 m   | 0; least clearance 0.22 m |
+| eq. 22 with `limit`        | 66 m   | 17                      |
+| blind                      | 58 m   | 24                      |
+
+The minimum turn (`full_turn`) prevents the contacts: without the tie-break there were none either. The tie-break makes
+the labels learnable: the same observation gets the same turn.
+
+Gradient: exact almost everywhere; zero by the direction of the turn.
 """
 
 import math
@@ -34,153 +41,163 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
-from lgmdjax.locomotion.shaping import FASTEST, SLOWEST
-from lgmdjax.minmax import maximum, minimum, clip
+from lgmdjax.locomotion.shaping import MAX_VELOCITY, MIN_VELOCITY
+from lgmdjax.minmax import clip, maximum, minimum
 
 Scalar = Float[Array, ""] | float
 
-SHORTEST = 0.01  # m; what is nearer counts as this far, so that 1/d stays finite
+MIN_DISTANCE = 0.01  # m; shorter distances are clipped to it, so that 1/d stays finite
 
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """The rule's gains (paper sec. 4.2), the gait's range, and what breaks a tie.
+    """Gains of the rule (paper sec. 4.2), range of the gait, minimum turn and tie-break.
 
-    With `full_turn` and `symmetry` zero the teacher is eq. 22 within the gait's range; with a gain zero it is
-    one of the two vehicles.
+    With `full_turn` and `tie_tolerance` zero the teacher is eq. 22 with `limit`. With one gain zero as well it is a
+    single vehicle.
     """
 
     base: Scalar = 1.2  # v_base; the paper's "1.2 m/s" is 1.2 times nominal
     gain_2a: Scalar = 0.8  # k_2a
     gain_3b: Scalar = 0.6  # k_3b
-    slowest: Scalar = SLOWEST  # the gait's range
-    fastest: Scalar = FASTEST
-    near: Scalar = 0.95  # m; nearer than this, it turns at least a part of full_turn
-    close: Scalar = 0.6  # m; nearer than this, at least all of it
-    full_turn: Scalar = 3.0  # |v_right - v_left|; the range's width is the most there is
-    symmetry: Scalar = 0.3  # |1/d_r - 1/d_l| / (1/d_r + 1/d_l) that still counts as a tie
-    steady: Scalar = 0.3  # |v_right - v_left| up to which the robot counts as not turning
-    first_side: Scalar = 1.0  # of an exact tie before any turn: 1 left, -1 right
+    min_velocity: Scalar = MIN_VELOCITY  # range of the gait
+    max_velocity: Scalar = MAX_VELOCITY
+    turn_distance: Scalar = 0.95  # m; below it the turn has a minimum size
+    full_turn_distance: Scalar = 0.6  # m; at and below it the minimum is full_turn
+    full_turn: Scalar = 3.0  # |v_right - v_left|; the width of the gait's range is the largest possible
+    tie_tolerance: Scalar = 0.3  # |1/d_r - 1/d_l| / (1/d_r + 1/d_l) below which both sides count as equally near
+    turn_deadband: Scalar = 0.3  # |v_right - v_left| up to which the robot counts as not turning
+    default_side: Scalar = 1.0  # direction at an exact tie before any turn: 1 left, -1 right
 
 
 @struct.dataclass(kw_only=True)
 class State:
-    """The way that the robot turns: 1 left, -1 right, 0 neither."""
+    """Direction of the robot's present turn: 1 left, -1 right, 0 none."""
 
     side: Float[Array, ""]
 
 
 def vehicle_2a(stimuli: Float[Array, "2"], base: Scalar, gain: Scalar) -> Float[Array, "2"]:
-    """Excite each side by its own sensor (eq. 18): turns away from what it senses, faster."""
+    """Excite each side by its own sensor (eq. 18): turn away from the stimulus, faster."""
     return base + gain * stimuli
 
 
 def vehicle_2b(stimuli: Float[Array, "2"], base: Scalar, gain: Scalar) -> Float[Array, "2"]:
-    """Excite each side by the other's sensor (eq. 19): charges at what it senses."""
+    """Excite each side by the opposite sensor (eq. 19): turn towards the stimulus, faster."""
     return base + gain * stimuli[::-1]
 
 
 def vehicle_3a(stimuli: Float[Array, "2"], base: Scalar, gain: Scalar) -> Float[Array, "2"]:
-    """Inhibit each side by its own sensor (eq. 20): turns towards what it senses, and rests there."""
+    """Inhibit each side by its own sensor (eq. 20): turn towards the stimulus, slower, and stop there."""
     return base - gain * stimuli
 
 
 def vehicle_3b(stimuli: Float[Array, "2"], base: Float[Array, "2"] | Scalar, gain: Scalar) -> Float[Array, "2"]:
-    """Inhibit each side by the other's sensor (eq. 21): turns away from what it senses, slower."""
+    """Inhibit each side by the opposite sensor (eq. 21): turn away from the stimulus, slower."""
     return base - gain * stimuli[::-1]
 
 
 def respond(params: Params, nearness: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Add vehicles 2a and 3b around one base velocity: eq. 22 with `nearness` for 1/d."""
+    """Return the sum of vehicles 2a and 3b around one base velocity: eq. 22 with `nearness` for 1/d.
+
+    >>> print(respond(Params(), jnp.asarray([0.0, 1.0])))  # an obstacle on the right: turn left
+    [0.6 2. ]
+    """
     excited = vehicle_2a(nearness, params.base, params.gain_2a)
     return vehicle_3b(nearness, excited, params.gain_3b)
 
 
 def rule(params: Params, distances: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Evaluate eq. 22 as printed, without limits; distances [m] below `SHORTEST` count as that."""
+    """Return the velocity of eq. 22 as printed, without limits; distances [m] are clipped to `MIN_DISTANCE`."""
     return respond(params, _nearness(distances))
 
 
 def limit(params: Params, velocity: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Bring a velocity into the range of the gait and keep the turn: shift both sides, then narrow the turn.
+    """Bring a velocity into the range of the gait and keep the turn: shift both sides first, narrow the turn after.
 
-    Clipping each side by itself would take most of the turn where it is needed: of (3.75, -0.64), for an
-    obstacle 0.3 m away on the left, this makes (2, -1), of (2.2, 0.8) it makes (2, 0.6).
+    Clipping each side by itself would lose most of the turn where it is needed most. The velocity (3.75, -0.64) belongs
+    to an obstacle 0.3 m away on the left:
+
+    >>> print(limit(Params(), jnp.asarray([3.75, -0.64])))
+    [ 2. -1.]
+    >>> print(limit(Params(), jnp.asarray([2.25, 0.75])))  # clipping each side would give (2, 0.75)
+    [2.  0.5]
     """
-    most = params.fastest - params.slowest
-    return _drive(params, jnp.mean(velocity), clip(velocity[1] - velocity[0], -most, most))
+    max_turn = params.max_velocity - params.min_velocity
+    return _from_mean_and_turn(params, jnp.mean(velocity), clip(velocity[1] - velocity[0], -max_turn, max_turn))
 
 
 def init(params: Params) -> State:
-    """Start without a turn behind it."""
+    """Return the state of a robot that has not turned yet."""
     return State(side=jnp.zeros(()))
 
 
 def step(params: Params, state: State, distances: Float[Array, "2"]) -> tuple[State, Float[Array, "2"]]:
-    """Teach the velocity for the nearest distances [m] left and right: eq. 22, limited, ties broken.
+    """Return the teacher's velocity for the nearest distances [m] on the left and right: eq. 22 with limits.
 
-    The turn is that of eq. 22, but from `near` to `close` its least size grows to `full_turn`. While near,
-    the side changes only when the other side is clearly nearer; a robot in front of a wall or in a corner
-    turns on.
+    The turn is that of eq. 22. Its minimum size grows from zero at `turn_distance` to `full_turn` at
+    `full_turn_distance`. Within `turn_distance` its direction changes only when the other side is clearly nearer, so
+    that a robot in front of a wall or in a corner continues its turn.
     """
     nearness = _nearness(distances)
     velocity = respond(params, nearness)
     turn = velocity[1] - velocity[0]
-    danger = clip((params.near - minimum(distances[0], distances[1])) / (params.near - params.close), 0.0, 1.0)
-    tied = jnp.abs(nearness[1] - nearness[0]) < params.symmetry * jnp.sum(nearness)
-    side = _side(params, state.side, turn, near=danger > 0, tied=tied)
-    strength = maximum(side * turn, danger * params.full_turn)
+    margin = params.turn_distance - minimum(distances[0], distances[1])
+    urgency = clip(margin / (params.turn_distance - params.full_turn_distance), 0.0, 1.0)
+    tied = jnp.abs(nearness[1] - nearness[0]) < params.tie_tolerance * jnp.sum(nearness)
+    side = _turn_side(params, state.side, turn, near=urgency > 0, tied=tied)
+    size = maximum(side * turn, urgency * params.full_turn)
     mean = jnp.mean(velocity)
-    limited = limit(params, mean + side * strength * jnp.asarray([-0.5, 0.5], velocity.dtype))
-    return watch(params, limited), limited
+    limited = limit(params, mean + side * size * jnp.asarray([-0.5, 0.5], velocity.dtype))
+    return track_turn(params, limited), limited
 
 
-def watch(params: Params, velocity: Float[Array, "2"]) -> State:
-    """Take note of how the robot is being driven, by the teacher or by somebody else.
+def track_turn(params: Params, velocity: Float[Array, "2"]) -> State:
+    """Return the state after a velocity, whichever policy commanded it.
 
-    A tie is then broken by the turn that is under way, which whoever drives knows of: a pupil can only learn from a
-    teacher whose labels hang on what both of them can tell.
+    The executed turn then breaks the next tie. A learner can only imitate labels that depend on information it has
+    itself, and it knows its own turn.
     """
     turn = velocity[1] - velocity[0]
-    return State(side=jnp.where(jnp.abs(turn) > params.steady, jnp.sign(turn), jnp.zeros_like(turn)))
+    return State(side=jnp.where(jnp.abs(turn) > params.turn_deadband, jnp.sign(turn), jnp.zeros_like(turn)))
 
 
 def check(params: Params) -> None:
-    """Raise `InputError` if a number is not finite, or the range or the distances are the wrong way round."""
+    """Raise `InputError` if a number is not finite or negative, or if a range is the wrong way round."""
     for name, value in vars(params).items():
         if not math.isfinite(value):
             raise InputError(f"braitenberg {name}: expected a finite number, got {value}; see braitenberg.Params")
-    for name in ("base", "gain_2a", "gain_3b", "close", "full_turn", "symmetry", "steady"):
+    for name in ("base", "gain_2a", "gain_3b", "full_turn_distance", "full_turn", "tie_tolerance", "turn_deadband"):
         if getattr(params, name) < 0:
             raise InputError(f"braitenberg {name}: expected a number >= 0, got {getattr(params, name)}")
-    for low, high in (("slowest", "fastest"), ("close", "near")):
+    for low, high in (("min_velocity", "max_velocity"), ("full_turn_distance", "turn_distance")):
         if not getattr(params, low) < getattr(params, high):
             raise InputError(
                 f"braitenberg {low}: expected less than {high} = {getattr(params, high)}, "
                 f"got {getattr(params, low)}; swap them"
             )
-    if params.first_side not in (-1, 1):
-        raise InputError(f"braitenberg first_side: expected 1 (left) or -1 (right), got {params.first_side}")
+    if params.default_side not in (-1, 1):
+        raise InputError(f"braitenberg default_side: expected 1 (left) or -1 (right), got {params.default_side}")
 
 
 def _nearness(distances: Float[Array, "2"]) -> Float[Array, "2"]:
-    return 1 / maximum(distances, SHORTEST)
+    return 1 / maximum(distances, MIN_DISTANCE)
 
 
-def _drive(params: Params, mean: Float[Array, ""], turn: Float[Array, ""]) -> Float[Array, "2"]:
-    """Make the velocity of a turn (v_right - v_left), its mean as near to the asked one as can be."""
+def _from_mean_and_turn(params: Params, mean: Float[Array, ""], turn: Float[Array, ""]) -> Float[Array, "2"]:
+    """Return the velocity with this turn (v_right - v_left) in the gait's range whose mean is nearest to `mean`."""
     half = jnp.abs(turn) / 2
-    mean = clip(mean, params.slowest + half, params.fastest - half)
+    mean = clip(mean, params.min_velocity + half, params.max_velocity - half)
     return jnp.stack([mean - turn / 2, mean + turn / 2])
 
 
-def _side(params: Params, last: Array, turn: Array, near: Array, tied: Array) -> Float[Array, ""]:
-    """Choose where to turn: on as last time while near and tied, else where eq. 22 turns.
+def _turn_side(params: Params, last: Array, turn: Array, near: Array, tied: Array) -> Float[Array, ""]:
+    """Choose the direction of the turn: the last one while near and tied, else that of eq. 22.
 
-    Where that turns nowhere it is again the last side, or the first one if something is near; far from
-    everything it stays undecided, so that a mirrored robot decides later for the mirrored side.
+    Where eq. 22 does not turn, it is the last direction, or `default_side` if an obstacle is near. Far from all
+    obstacles it stays 0, so that a mirrored robot later decides for the mirrored side.
     """
-    known = jnp.where((last == 0) & near, params.first_side, last)
-    asked = jnp.sign(turn)
-    held = near & tied & (last != 0)
-    return jnp.where(held | (asked == 0), known, asked)
+    default = jnp.where((last == 0) & near, params.default_side, last)
+    requested = jnp.sign(turn)
+    keep = near & tied & (last != 0)
+    return jnp.where(keep | (requested == 0), default, requested)

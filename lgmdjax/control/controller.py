@@ -1,12 +1,11 @@
-"""The robot's nervous system: stereo frame in, eighteen joint targets out.
+"""The robot's controller: stereo frame in, eighteen joint targets out.
 
-Two LGMDs look at the two hemifields, a driver turns what they say into a velocity for either side, and
-the rhythm of the CPG, shaped for that velocity, becomes joint angles. The three parts run at two beats:
-`see` and the driver once a camera frame, `move` once a physics substep. `step` composes them as they run
-on a robot with nothing but a camera.
+Two LGMDs process the two hemifields, a policy turns their outputs into a left and right velocity, and the output of
+the CPG, shaped for that velocity, becomes joint angles. There are two rates: `detect` and `decide` run once a camera
+frame, `move` once a physics substep. `step` composes them for a robot whose only sensor is the camera.
 
-The driver is an argument (`lgmdjax.control.policies`), since the same eyes and legs serve the learned navigator and
-everything that it is compared with.
+The policy is an argument (`lgmdjax.control.policies`), so that the learned navigator and the policies that it is
+compared with share the same detectors and gait.
 
 | symbol | name          | unit              | equation |
 | ------ | ------------- | ----------------- | -------- |
@@ -19,85 +18,84 @@ walking robot", fig. 2 and sec. 3.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from lgmdjax.control.policies import Driver, Senses
+from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
 from lgmdjax.locomotion import cpg, shaping
 
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """Everything between the eyes and the servos that a gradient can reach."""
+    """All parameters between camera and servos that can be differentiated."""
 
     lgmd: lgmd.Params
-    driver: Any  # the parameters of whichever driver is at the wheel
+    policy: PyTree  # of the type that the policy takes
     cpg: cpg.Params
     shaping: shaping.Params
 
 
 @struct.dataclass(kw_only=True)
 class State:
-    """What the eyes, the driver and the rhythm carry from beat to beat; `velocity` is the standing command."""
+    """States of detectors, policy and CPG, and the velocity commanded last."""
 
-    lgmd: lgmd.State  # two eyes, stacked
-    driver: Any
+    lgmd: lgmd.State  # of both eyes, stacked
+    policy: PyTree
     cpg: cpg.State
     velocity: Float[Array, "2"]
 
 
-def init(params: Params, frames: Float[Array, "2 height width"], driver: Driver, key: Array) -> State:
-    """Start with the first stereo frame as the picture to compare with, the rhythm settled, and standing still."""
+def init(params: Params, frames: Float[Array, "2 height width"], policy: Policy, key: Array) -> State:
+    """Return the state at a first stereo frame: zero velocity, and the CPG on its limit cycle."""
     return State(
-        lgmd=open_eyes(params, frames),
-        driver=driver.init(params.driver, key),
-        cpg=cpg.settled(params.cpg),
+        lgmd=init_lgmd(params, frames),
+        policy=policy.init(params.policy, key),
+        cpg=cpg.limit_cycle_state(params.cpg),
         velocity=jnp.zeros(2),
     )
 
 
-def open_eyes(params: Params, frames: Float[Array, "2 height width"]) -> lgmd.State:
-    """Start both LGMDs on one stereo frame, so that the first difference they see is zero."""
+def init_lgmd(params: Params, frames: Float[Array, "2 height width"]) -> lgmd.State:
+    """Return the states of both LGMDs at a first stereo frame, so that their first frame difference is zero."""
     return jax.vmap(lgmd.init, in_axes=(None, 0))(params.lgmd, frames)
 
 
-def see(params: Params, state: State, frames: Float[Array, "2 height width"]) -> tuple[State, lgmd.Response]:
-    """Show one stereo frame to the two LGMDs (eqs. 7-16); the response has one entry an eye, left first."""
-    eyes, response = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(params.lgmd, state.lgmd, frames)
-    return replace(state, lgmd=eyes), response
+def detect(params: Params, state: State, frames: Float[Array, "2 height width"]) -> tuple[State, lgmd.Response]:
+    """Step both LGMDs by one stereo frame (eqs. 7-16); the response has one entry for each eye, left first."""
+    lgmd_state, response = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(params.lgmd, state.lgmd, frames)
+    return replace(state, lgmd=lgmd_state), response
 
 
-def decide(params: Params, state: State, senses: Senses, driver: Driver) -> State:
-    """Let the driver turn the senses into the standing command (eq. 17)."""
-    driven, velocity = driver.step(params.driver, state.driver, senses)
-    return replace(state, driver=driven, velocity=velocity)
+def decide(params: Params, state: State, observation: Observation, policy: Policy) -> State:
+    """Let the policy choose the velocity for an observation (eq. 17)."""
+    policy_state, velocity = policy.step(params.policy, state.policy, observation)
+    return replace(state, policy=policy_state, velocity=velocity)
 
 
 def move(params: Params, state: State, interval: float) -> tuple[State, Float[Array, "6 3"]]:
-    """Advance the rhythm by `interval` seconds and shape it into joint targets [rad] for the standing command."""
-    rhythm_state, rhythm = cpg.step(params.cpg, state.cpg, interval)
-    targets = shaping.shape(params.shaping, rhythm, state.velocity)
-    return replace(state, cpg=rhythm_state), targets
+    """Step the CPG by `interval` seconds and shape its output into joint targets [rad] for the commanded velocity."""
+    cpg_state, rhythm = cpg.step(params.cpg, state.cpg, interval)
+    targets = shaping.apply(params.shaping, rhythm, state.velocity)
+    return replace(state, cpg=cpg_state), targets
 
 
 def step(
-    params: Params, state: State, frames: Float[Array, "2 height width"], driver: Driver, interval: float
+    params: Params, state: State, frames: Float[Array, "2 height width"], policy: Policy, interval: float
 ) -> tuple[State, Float[Array, "6 3"]]:
-    """Turn one stereo frame into joint targets: see, decide, move, for a driver that needs only the eyes.
+    """Turn one stereo frame into joint targets [rad]: detect, decide, move.
 
-    A robot without a laser has no distances; the senses then hold zeros there.
+    Without a laser scanner the distances of the observation are zero, so the policy must not need them.
     """
-    state, response = see(params, state, frames)
-    senses = Senses(
+    state, response = detect(params, state, frames)
+    observation = Observation(
         u=response.u,
         feed_forward=response.feed_forward,
         excitation=response.excitation,
         distances=jnp.zeros(2),
     )
-    state = decide(params, state, senses, driver)
+    state = decide(params, state, observation, policy)
     return move(params, state, interval)

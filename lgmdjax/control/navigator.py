@@ -1,4 +1,4 @@
-"""The navigation controller: a small recurrent network from what two eyes say to a velocity for either side.
+"""The navigator: a small recurrent network from the outputs of both LGMDs to left and right velocity.
 
 | symbol         | name                       | unit              | equation |
 | -------------- | -------------------------- | ----------------- | -------- |
@@ -9,72 +9,68 @@
 
 Source: Cizek & Faigl, sec. 3.4 (fig. 7); Hochreiter & Schmidhuber 1997, with the forget gate and the initial
 weights of Keras. The network is a flax module, split once into its graph and a dictionary of weights, so that
-`step` is a pure function. Inputs are standardised and outputs scaled by constants that come from the training
-data and are not trained; they let the network work around zero, as the paper's must have learned to.
+`step` is a pure function. Inputs are standardised and outputs rescaled by constants of the training data, which are not
+trained. The network then works around zero; the paper's must have learned the offsets and scales.
 
-| variant           | what it is                                                                          |
-| ----------------- | ----------------------------------------------------------------------------------- |
-| `lstm`            | the paper's: two inputs, 32 LSTM units with sigmoid gates, two linear outputs       |
-| `lstm-efference`  | the same with its own last velocity as two further inputs, as insects have it       |
-| `feed-forward`    | 32 tanh units without memory                                                        |
-| `mean`            | the mean of the training velocities, whatever the eyes say                          |
+| variant           | what it is                                                                            |
+| ----------------- | ------------------------------------------------------------------------------------- |
+| `lstm`            | the paper's: two inputs, 32 LSTM units with sigmoid gates, two linear outputs         |
+| `lstm-efference`  | the same with its last velocity as two further inputs (efference copy, as in insects) |
+| `feed-forward`    | 32 tanh units without memory                                                          |
+| `mean`            | the mean of the training velocities, whatever u is                                    |
 
 The outputs are linear, so they can leave the range of the gait; `braitenberg.limit` brings them back.
 
-A `symmetric` navigator looks at the world and, with a memory of its own, at its mirror image, and does the mean of
-what it would do in the one and, mirrored back, in the other:
+A `symmetric` navigator also runs on the mirror image, with a separate memory, and averages both outputs:
 
     f_sym(u) = (f(u) + M f(M u)) / 2,  M (left, right) = (right, left),
 
-so that mirrored u give the mirrored commands, exactly. A fitted network is symmetric only by chance: far off from
-everything ours leant to one side; the mean of both has 5 to 9 % less squared error in rooms kept back.
+so that mirrored u give exactly the mirrored velocities. A fitted network by itself is only approximately symmetric: far
+from all obstacles ours turned to one side. The average has 5 to 9 % less squared error in held-out rooms.
 """
 
-import json
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx, struct, traverse_util
-from jaxtyping import Array, Float
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from jaxtyping import Array, Float, PyTree
 
+from lgmdjax.control.names import VARIANTS, Variant
 from lgmdjax.errors import InputError
-from lgmdjax.runtime import versions
+from lgmdjax.runtime import storage, versions
+from lgmdjax.runtime.storage import JsonObject
 
-Variant = Literal["lstm", "lstm-efference", "feed-forward", "mean"]
-VARIANTS: tuple[Variant, ...] = get_args(Variant)
 UNITS = 32
-FORMAT, VERSION = "lgmdjax navigator", "2"
+FILE = storage.TensorFile(
+    format="lgmdjax navigator", version="2", name="a navigator", remedy="`lgmdjax train` makes one"
+)
 SCALES = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """Weights by layer, and the constants that standardise u and v: means and deviations in the data."""
+    """Weights by layer, and means and standard deviations of u and v in the training data."""
 
-    weights: dict[str, Any]
+    weights: dict[str, PyTree]
     input_mean: Float[Array, "2"]
     input_scale: Float[Array, "2"]
     output_mean: Float[Array, "2"]
     output_scale: Float[Array, "2"]
     variant: Variant = struct.field(pytree_node=False, default="lstm")
     units: int = struct.field(pytree_node=False, default=UNITS)
-    symmetric: bool = struct.field(pytree_node=False, default=False)  # shown the mirror image too
+    symmetric: bool = struct.field(pytree_node=False, default=False)  # also run on the mirror image
 
 
 @struct.dataclass(kw_only=True)
 class State:
-    """What the network remembers (s of eq. 17) and the last velocity; variants without memory carry zeros."""
+    """Memory of the network (s of eq. 17) and the last velocity; variants without memory carry zeros."""
 
-    hidden: Float[Array, "views units"]  # of the world, and of its mirror image if that is shown
+    hidden: Float[Array, "views units"]  # views: the scene, and its mirror image if symmetric
     cell: Float[Array, "views units"]
     velocity: Float[Array, "2"]
 
@@ -99,14 +95,19 @@ class _FeedForward(nnx.Module):
 
 
 def create(key: Array, variant: Variant = "lstm", units: int = UNITS, *, symmetric: bool = False) -> Params:
-    """Draw an untrained navigator as Keras does: Glorot inputs, orthogonal recurrence, forget bias 1."""
+    """Return an untrained navigator, initialised as in Keras: Glorot inputs, orthogonal recurrence, forget bias 1.
+
+    >>> params = create(jax.random.key(0), "feed-forward", units=8)
+    >>> sum(leaf.size for leaf in jax.tree.leaves(params.weights))
+    42
+    """
     if variant not in VARIANTS:
         raise InputError(f"navigator variant: expected one of {', '.join(VARIANTS)}, got {variant!r}")
     if not isinstance(units, int) or units < 1:
         raise InputError(f"navigator units: expected 1 or more, got {units}; the paper has 32")
     ones = jnp.ones(2)
     return Params(
-        weights=_draw(key, variant, units),
+        weights=_sample_weights(key, variant, units),
         input_mean=0.5 * ones,
         input_scale=0.1 * ones,
         output_mean=1.2 * ones,
@@ -118,81 +119,57 @@ def create(key: Array, variant: Variant = "lstm", units: int = UNITS, *, symmetr
 
 
 def init(params: Params) -> State:
-    """Start with nothing remembered, and the mean velocity as the last one."""
-    nothing = jnp.zeros((2 if params.symmetric else 1, params.units), params.output_mean.dtype)
-    velocity = jnp.mean(_mirrored(params, params.output_mean), axis=0)
-    return State(hidden=nothing, cell=nothing, velocity=velocity)
+    """Return a state with empty memory and the mean velocity as the last one."""
+    empty = jnp.zeros((2 if params.symmetric else 1, params.units), params.output_mean.dtype)
+    velocity = jnp.mean(_views(params, params.output_mean), axis=0)
+    return State(hidden=empty, cell=empty, velocity=velocity)
 
 
 def step(params: Params, state: State, u: Float[Array, "2"]) -> tuple[State, Float[Array, "2"]]:
-    """Turn one frame's u into a velocity (eq. 17), and remember both.
+    """Return the velocity for the u of one frame (eq. 17), and the next state.
 
-    A caller that drives with another velocity than the one returned (limited, or somebody else's) puts it
-    into the state's `velocity`, which `lstm-efference` sees next.
+    If the robot executes another velocity than the returned one (a limited one, or another policy's), the caller must
+    put it into the state's `velocity`, the next input of `lstm-efference`.
     """
-    views = jax.vmap(partial(_look, params))
-    (cell, hidden), answers = views((state.cell, state.hidden), _mirrored(params, u), _mirrored(params, state.velocity))
-    # The answer to the mirror image, the second if there is one, is mirrored back.
-    velocity = jnp.mean(answers.at[1:].set(answers[1:, ::-1]), axis=0)
+    forward = jax.vmap(partial(_forward, params))
+    (cell, hidden), outputs = forward((state.cell, state.hidden), _views(params, u), _views(params, state.velocity))
+    # The second output, if there is one, belongs to the mirror image and is mirrored back.
+    velocity = jnp.mean(outputs.at[1:].set(outputs[1:, ::-1]), axis=0)
     return State(hidden=hidden, cell=cell, velocity=velocity), velocity
 
 
-def save(path: Path | str, params: Params, metadata: Mapping[str, Any] | None = None) -> None:
+def save(path: Path | str, params: Params, metadata: JsonObject | None = None) -> None:
     """Write the navigator as one safetensors file, its variant, versions and `metadata` (JSON) in the header.
 
-    `metadata` is for what the eyes must be like for this network: calibration, camera, room statistics. The
-    file is written beside its place and moved there, so that no reader finds half of one.
+    `metadata` tells which camera and detector the network was trained with, and in which rooms.
     """
-    path = Path(path)
-    tensors = {name: np.asarray(value) for name, value in _tensors(params).items()}
-    if not all(np.isfinite(value).all() for value in tensors.values()):
-        raise InputError(f"{path}: expected finite weights to save, got some that are not; train again")
     structure = {"variant": params.variant, "units": params.units, "symmetric": params.symmetric}
-    header = {**structure, "versions": versions.installed(), **(metadata or {})}
-    text = {"format": FORMAT, "version": VERSION} | {name: json.dumps(x) for name, x in header.items()}
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        save_file(tensors, unfinished, text)
-        unfinished.replace(path)
-    except (OSError, SafetensorError) as error:
-        unfinished.unlink(missing_ok=True)
-        raise InputError(f"{path}: expected a place to write to, got {error}; choose another") from error
+    tensors = {name: np.asarray(value) for name, value in _tensors(params).items()}
+    storage.save_tensors(path, tensors, FILE, {**structure, "versions": versions.installed(), **(metadata or {})})
 
 
-def load(path: Path | str) -> tuple[Params, dict[str, Any]]:
+def load(path: Path | str) -> tuple[Params, JsonObject]:
     """Read a navigator that `save` wrote, and its metadata; raise `InputError` for any other file."""
-    again = "`lgmdjax train` makes one"
+    tensors, metadata = storage.load_tensors(path, FILE)
     try:
-        with safe_open(path, framework="numpy") as file:
-            header = file.metadata() or {}
-            if header.get("format") != FORMAT:
-                raise InputError(f"{path}: expected a navigator, got another kind of file; {again}")
-            if header.get("version") != VERSION:
-                raise InputError(f"{path}: expected version {VERSION}, got {header.get('version')}; {again}")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        metadata = {name: json.loads(text) for name, text in header.items() if name not in ("format", "version")}
-        structure = (metadata["variant"], metadata["units"])
-        template = jax.eval_shape(lambda: create(jax.random.key(0), *structure, symmetric=metadata["symmetric"]))
-    except (OSError, SafetensorError, json.JSONDecodeError, KeyError) as error:
-        raise InputError(f"{path}: expected a safetensors file of a navigator, got {error}; {again}") from error
-    expected = {name: value.shape for name, value in _tensors(template).items()}
-    found = {name: value.shape for name, value in tensors.items()}
-    if found != expected:
-        raise InputError(f"{path}: expected weights {expected}, got {found}; {again}")
-    if not all(np.isfinite(value).all() for value in tensors.values()):
-        raise InputError(f"{path}: expected finite weights, got some that are not; {again}")
+        variant, units, symmetric = (metadata[name] for name in ("variant", "units", "symmetric"))
+    except KeyError as error:
+        raise InputError(f"{path}: expected a header that names {error}, got none; {FILE.remedy}") from error
+    template = jax.eval_shape(lambda: create(jax.random.key(0), variant, units, symmetric=symmetric))
+    shapes = {name: value.shape for name, value in _tensors(template).items()}
+    storage.check_shapes(path, tensors, FILE, shapes)
     return _with_tensors(template, tensors), metadata
 
 
-def _mirrored(params: Params, sides: Float[Array, "2"]) -> Float[Array, "views 2"]:
-    """Put something of both sides and its mirror image together, or alone."""
+def _views(params: Params, sides: Float[Array, "2"]) -> Float[Array, "views 2"]:
+    """Stack a (left, right) pair and, if symmetric, its mirror image."""
     return jnp.stack([sides, sides[::-1]] if params.symmetric else [sides])
 
 
-def _look(
+def _forward(
     params: Params, memory: tuple[Array, Array], u: Float[Array, "2"], last: Float[Array, "2"]
 ) -> tuple[tuple[Array, Array], Float[Array, "2"]]:
-    """Answer to one view of the world."""
+    """Return the next memory and the velocity for one view of the scene."""
     if params.variant == "mean":
         return memory, params.output_mean
     inputs = (u - params.input_mean) / params.input_scale
@@ -205,7 +182,7 @@ def _look(
 
 @lru_cache
 def _graph(variant: Variant, units: int) -> nnx.GraphDef:
-    """Describe the network without its weights."""
+    """Return the structure of the network without its weights."""
     return nnx.split(nnx.eval_shape(lambda: _network(variant, units, nnx.Rngs(0))))[0]
 
 
@@ -215,20 +192,20 @@ def _network(variant: Variant, units: int, rngs: nnx.Rngs) -> nnx.Module:
     return _Recurrent(4 if variant == "lstm-efference" else 2, units, rngs)
 
 
-def _draw(key: Array, variant: Variant, units: int) -> dict[str, Any]:
+def _sample_weights(key: Array, variant: Variant, units: int) -> dict[str, PyTree]:
     if variant == "mean":
         return {}
     weights = nnx.to_pure_dict(nnx.split(_network(variant, units, nnx.Rngs(key)))[1])
     weights = jax.tree.map(lambda weight: jnp.asarray(weight, dtype=float), weights)
     if variant != "feed-forward":
-        # Gates are input, forget, cell, output. An open forget gate lets early gradients reach far back.
+        # The gates are input, forget, cell, output. With forget bias 1 the first gradients reach far back in time.
         bias = weights["cell"]["dense_h"]["bias"]
         weights["cell"]["dense_h"]["bias"] = bias.at[units : 2 * units].set(1)
     return weights
 
 
-def _tensors(params: Params) -> dict[str, Any]:
-    """List weights and scales by name."""
+def _tensors(params: Params) -> dict[str, PyTree]:
+    """Return weights and scales by name."""
     weights = traverse_util.flatten_dict({"weights": params.weights}, sep=".")
     return {name: getattr(params, name) for name in SCALES} | {str(name): w for name, w in weights.items()}
 

@@ -1,34 +1,38 @@
-"""Who is at the wheel: five ways from the senses to a velocity of either side, of one shape.
+"""Five policies with one interface: observation to left and right velocity.
 
-| driver  | looks at     | does                                                             |
-| ------- | ------------ | ---------------------------------------------------------------- |
-| teacher | laser        | eq. 22, limited and tie-broken (`lgmdjax.control.braitenberg`)            |
-| learned | u            | the trained network, limited (`lgmdjax.control.navigator`)                |
-| blind   | nothing      | walks straight on at v_base                                       |
-| direct  | u            | eq. 22 with a multiple of u - 0.5 in the place of 1/d, no memory  |
-| random  | nothing      | replays commands that the teacher gave somewhere else             |
+| policy  | observes  | does                                                             |
+| ------- | --------- | ---------------------------------------------------------------- |
+| teacher | distances | eq. 22, limited and tie-broken (`lgmdjax.control.braitenberg`)   |
+| learned | u         | the trained network, limited (`lgmdjax.control.navigator`)       |
+| blind   | nothing   | walks straight ahead at v_base                                   |
+| direct  | u         | eq. 22 with a multiple of u - 0.5 in place of 1/d, no memory     |
+| random  | nothing   | replays velocities that the teacher commanded in other rooms     |
 
-Each is a pair of pure functions: `init(params, key) -> state` and `step(params, state, senses) -> (state,
-velocity)`, with the velocity in multiples of the nominal 0.05 m/s, left first.
+Each is a `Policy`: a pair of pure functions and a name. Velocities are multiples of the nominal 0.05 m/s, left first.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from lgmdjax.control import braitenberg, navigator
+from lgmdjax.control.names import POLICY_NAMES
+from lgmdjax.errors import InputError
 
-RANGE = braitenberg.Params()  # its limits are what the legs can do, whoever drives
+ParamsT = TypeVar("ParamsT")
+StateT = TypeVar("StateT")
+
+GAIT_RANGE = braitenberg.Params()  # of which `limit` reads the range of the gait, the same for all policies
 
 
 @struct.dataclass(kw_only=True)
-class Senses:
-    """What one frame tells: the two LGMDs and the scanner's two hemifields, left first."""
+class Observation:
+    """What a policy may use in one frame: outputs of the two LGMDs and distances in the two hemifields, left first."""
 
     u: Float[Array, "2"]  # LGMD output, 0.5..1
     feed_forward: Float[Array, "2"]  # FF cell, grey
@@ -36,89 +40,123 @@ class Senses:
     distances: Float[Array, "2"]  # nearest obstacle, m
 
 
-class Driver(NamedTuple):
-    """A way to drive."""
+@dataclass(frozen=True)
+class Policy(Generic[ParamsT, StateT]):
+    """A policy as pure functions; hashable, so that it can be a static argument of `jax.jit`.
+
+    Args:
+        name: one of `names.POLICY_NAMES`, or "switch".
+        init: `init(params, key) -> state`.
+        step: `step(params, state, observation) -> (state, velocity)`.
+        uses_camera: whether `step` reads outputs of the LGMDs, so that pictures have to be rendered.
+    """
 
     name: str
-    init: Callable[[Any, Array], Any]
-    step: Callable[[Any, Any, Senses], tuple[Any, Float[Array, "2"]]]
+    init: Callable[[ParamsT, Array], StateT]
+    step: Callable[[ParamsT, StateT, Observation], tuple[StateT, Float[Array, "2"]]]
+    uses_camera: bool = False
 
 
 @struct.dataclass(kw_only=True)
-class Blind:
-    """The command of a robot that looks at nothing."""
+class BlindParams:
+    """The constant velocity of policy blind."""
 
     velocity: Float[Array, "2"]
 
 
 @struct.dataclass(kw_only=True)
-class Direct:
-    """Eq. 22 straight on the LGMDs: `gain` [1/m] makes u - 0.5 stand for 1/d."""
+class DirectParams:
+    """Eq. 22 on the outputs of the LGMDs: `gain` [1/m] times u - 0.5 replaces 1/d."""
 
     rule: braitenberg.Params
     gain: Float[Array, ""]
 
 
 @struct.dataclass(kw_only=True)
-class Replay:
-    """Commands that the teacher once gave, one a frame, in rooms other than the one walked."""
+class ReplayParams:
+    """Velocities that the teacher commanded, one a frame, in rooms other than the present one."""
 
     velocities: Float[Array, "frames 2"]
 
 
-def _step_teacher(params: braitenberg.Params, state: braitenberg.State, senses: Senses):
-    return braitenberg.step(params, state, senses.distances)
+def _step_teacher(
+    params: braitenberg.Params, state: braitenberg.State, observation: Observation
+) -> tuple[braitenberg.State, Float[Array, "2"]]:
+    return braitenberg.step(params, state, observation.distances)
 
 
-def _step_learned(params: navigator.Params, state: navigator.State, senses: Senses):
-    state, asked = navigator.step(params, state, senses.u)
-    velocity = braitenberg.limit(RANGE, asked)
-    return replace(state, velocity=velocity), velocity  # what was done, not what was asked, is its next input
+def _step_learned(
+    params: navigator.Params, state: navigator.State, observation: Observation
+) -> tuple[navigator.State, Float[Array, "2"]]:
+    state, output = navigator.step(params, state, observation.u)
+    velocity = braitenberg.limit(GAIT_RANGE, output)
+    return replace(state, velocity=velocity), velocity  # the network's next input is the limited velocity
 
 
-def _step_blind(params: Blind, state: None, senses: Senses):
+def _step_blind(params: BlindParams, state: None, observation: Observation) -> tuple[None, Float[Array, "2"]]:
     return state, params.velocity
 
 
-def _step_direct(params: Direct, state: None, senses: Senses):
-    nearness = params.gain * (senses.u - 0.5)
+def _step_direct(params: DirectParams, state: None, observation: Observation) -> tuple[None, Float[Array, "2"]]:
+    nearness = params.gain * (observation.u - 0.5)
     return state, braitenberg.limit(params.rule, braitenberg.respond(params.rule, nearness))
 
 
-def _start_replay(params: Replay, key: Array) -> Int[Array, ""]:
+def _init_replay(params: ReplayParams, key: Array) -> Int[Array, ""]:
+    """Sample the frame to begin with."""
     return jax.random.randint(key, (), 0, len(params.velocities))
 
 
-def _step_replay(params: Replay, state: Int[Array, ""], senses: Senses):
+def _step_replay(
+    params: ReplayParams, state: Int[Array, ""], observation: Observation
+) -> tuple[Int[Array, ""], Float[Array, "2"]]:
     return (state + 1) % len(params.velocities), jnp.take(params.velocities, state, axis=0)
 
 
-TEACHER = Driver("teacher", lambda params, key: braitenberg.init(params), _step_teacher)
-LEARNED = Driver("learned", lambda params, key: navigator.init(params), _step_learned)
-BLIND = Driver("blind", lambda params, key: None, _step_blind)
-DIRECT = Driver("direct", lambda params, key: None, _step_direct)
-RANDOM = Driver("random", _start_replay, _step_replay)
-ALL = (TEACHER, LEARNED, BLIND, DIRECT, RANDOM)
+TEACHER = Policy("teacher", lambda params, key: braitenberg.init(params), _step_teacher)
+LEARNED = Policy("learned", lambda params, key: navigator.init(params), _step_learned, uses_camera=True)
+BLIND = Policy("blind", lambda params, key: None, _step_blind)
+DIRECT = Policy("direct", lambda params, key: None, _step_direct, uses_camera=True)
+REPLAY = Policy("random", _init_replay, _step_replay)
+
+POLICIES: tuple[Policy, ...] = (TEACHER, LEARNED, BLIND, DIRECT, REPLAY)
+"""All policies, in the order of `names.POLICY_NAMES`."""
+
+
+def get_policy(name: str) -> Policy:
+    """Return the policy of this name; raise `InputError` for an unknown one.
+
+    >>> get_policy("direct").uses_camera
+    True
+    """
+    if name not in POLICY_NAMES:
+        raise InputError(f"policy: expected one of {', '.join(POLICY_NAMES)}, got {name!r}")
+    return POLICIES[POLICY_NAMES.index(name)]
 
 
 @struct.dataclass(kw_only=True)
-class Anyone:
-    """The parameters of all five, in the order of `ALL`, and which of them drives."""
+class PolicySwitch:
+    """The parameters of all five policies, in the order of `POLICIES`, and the index of the active one."""
 
-    seat: Int[Array, ""]
-    drivers: tuple[braitenberg.Params, navigator.Params, Blind, Direct, Replay]
-
-
-def _init_anyone(params: Anyone, key: Array) -> tuple[Any, ...]:
-    return tuple(driver.init(own, key) for driver, own in zip(ALL, params.drivers, strict=True))
+    active: Int[Array, ""]
+    policies: tuple[braitenberg.Params, navigator.Params, BlindParams, DirectParams, ReplayParams]
 
 
-def _step_anyone(params: Anyone, states: tuple[Any, ...], senses: Senses):
-    results = [driver.step(own, state, senses) for driver, own, state in zip(ALL, params.drivers, states, strict=True)]
+def _init_switch(params: PolicySwitch, key: Array) -> tuple[PyTree, ...]:
+    return tuple(policy.init(own, key) for policy, own in zip(POLICIES, params.policies, strict=True))
+
+
+def _step_switch(
+    params: PolicySwitch, states: tuple[PyTree, ...], observation: Observation
+) -> tuple[tuple[PyTree, ...], Float[Array, "2"]]:
+    results = [
+        policy.step(own, state, observation)
+        for policy, own, state in zip(POLICIES, params.policies, states, strict=True)
+    ]
     velocities = jnp.stack([velocity for _, velocity in results])
-    return tuple(state for state, _ in results), jnp.take(velocities, params.seat, axis=0)
+    return tuple(state for state, _ in results), jnp.take(velocities, params.active, axis=0)
 
 
-# Compiling a crowd's walk takes longer than the sums of all five drivers ever will: one program serves them all,
-# and who is at the wheel is a number.
-ANYONE = Driver("anyone", _init_anyone, _step_anyone)
+# One compiled program serves all policies, since the active one is a number. Computing the other four costs less than
+# compiling a second rollout.
+SWITCH = Policy("switch", _init_switch, _step_switch, uses_camera=True)

@@ -1,32 +1,38 @@
-"""Why a robot touched something: recorded walks taken apart at every collision, and collisions sorted into kinds.
+"""Why a robot collided: each collision of recorded walks is described and classified by its cause.
 
-| kind                 | what happened in the last 2.5 s                                              |
-| -------------------- | ---------------------------------------------------------------------------- |
-| tail swing           | tail or hind leg touched: a limit of the rule, whose scanner looks ahead     |
-| corner               | things stood near on both sides at once: turning from one led to the other   |
-| did not see          | u of neither eye rose above what it is with nothing near                     |
-| saw both sides       | u rose alike on both sides, and the command did not turn                     |
-| turned the other way | the command turned against the label                                         |
-| turned too late      | all else: not against it, but not enough or not in time                      |
+| cause                | condition in the 2.5 s before the contact                                  |
+| -------------------- | -------------------------------------------------------------------------- |
+| tail swing           | the tail or a hind leg touched; the rule's scanner looks only ahead        |
+| corner               | obstacles were near on both sides at once                                  |
+| did not see          | neither u rose above its baseline                                          |
+| saw both sides       | both u rose alike, and the command did not turn                            |
+| turned the other way | the command turned against the label                                       |
+| turned too late      | otherwise: the command did not turn the wrong way, but too little or late  |
 
-The first that fits is the kind: where it happened, then what the eyes said, then what was done about it.
+The first cause whose condition holds is chosen.
 
-u rises with the robot's own turning no less than with nearness: with nothing near it is 0.53 while the robot walks
-straight, and 0.69 in a hard turn (the testing room, medians). What it is with nothing near is therefore looked up among
-frames with as much turning, and is taken from the walks themselves, since floors differ (`measure`).
+u rises not only near obstacles but also when the robot turns. Medians of u with nothing near, in the testing room:
 
-| symbol    | name                                                          | unit    |
-| --------- | ------------------------------------------------------------- | ------- |
-| u         | LGMD outputs, averaged over the gait cycle that ends there    | 1       |
-| v_r - v_l | turn, of the command or of the label; positive to the left    | nominal |
+| walking   | u    |
+| --------- | ---- |
+| straight  | 0.53 |
+| hard turn | 0.69 |
 
-Works on host records with axes (robot, frame). Where a trial ends with the first touch, those collisions are its own
-that come before the end that `trials.judge` finds.
+The baseline of u is therefore looked up among frames with similar turning. It is fitted to the walks themselves, since
+it depends on the texture of the floor (`fit_baseline`).
+
+| symbol    | name                                                       | unit    |
+| --------- | ---------------------------------------------------------- | ------- |
+| u         | LGMD outputs, averaged over the preceding gait cycle       | 1       |
+| v_r - v_l | turn, of the command or of the label; positive to the left | nominal |
+
+Works on host records with axes (robot, frame). In a trial that ends at the first contact, only collisions before the
+end found by `trials.find_outcome` belong to the trial.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -37,205 +43,217 @@ from scipy import ndimage
 from lgmdjax.control import braitenberg
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import contacts, metrics
-from lgmdjax.evaluation.metrics import AVERAGED
+from lgmdjax.evaluation.metrics import AVERAGING_TIME
 from lgmdjax.sensors import laser
-from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
+from lgmdjax.simulation.closed_loop import FRAME_RATE, AnyArray, Record
 from lgmdjax.world import arena
 
-KINDS = {
-    "tail swing": "tail or a hind leg touched: the rule's scanner looks ahead",
-    "corner": "things stood near on both sides at once: turning from one led to the other",
-    "did not see": "neither eye said more than it does with nothing near",
-    "saw both sides": "both eyes said alike that something is near, and the command did not turn",
-    "turned the other way": "the command turned against what the rule asked for",
-    "turned too late": "the command did not turn the wrong way, but not enough or not in time",
-}
+_Tree = TypeVar("_Tree")
 
-WINDOW = 2.5  # s before the touch: three gait cycles, in which a hard turn takes the robot round by 40 degrees
-FAR = 1.2  # m; where nothing is nearer, nothing is near: the rule begins to turn at 0.8 m
-RISEN = 0.99  # quantile of u with nothing near; surpassed in 1 of 5 to 14 windows with nothing near, 0.95 in 1 of 3
-BANDS = (0.3, 1.0, 2.0)  # nominal; between these |v_r - v_l|, u with nothing near is taken to be one thing
-LEAST = 10.0  # s of walking with nothing near that tell what u then is
-LEAST_OF_BAND = 3.0  # s of it that tell so for one of the bands
-TELLS = 0.5  # spreads of u_l - u_r; 9 of 10 frames of straight walking lie below, 3 of 4 of hard turns above
-STEADY = float(braitenberg.Params().steady)  # nominal; a smaller |v_r - v_l| counts as no turn, as for the rule
-MIDDLE = 0.05  # m; middle legs, which step 4 cm, touch no farther ahead or behind: neither front nor tail
-NEAR = float(braitenberg.Params().close)  # m; for what is nearer the rule turns as hard as it can
-BESIDE = 0.35  # rad; what is nearer to the heading stands ahead: half a robot at 0.5 m is 0.4 rad wide
-ABEAM = 0.5 * laser.Params().field_of_view  # rad; what is farther from the heading is not walked into
-_CYCLE = round(AVERAGED * FRAME_RATE)  # frames
+CAUSES = {
+    "tail swing": "the tail or a hind leg touched: the rule's scanner looks only ahead",
+    "corner": "obstacles were near on both sides at once: turning from one led to the other",
+    "did not see": "neither eye's u rose above its level with nothing near",
+    "saw both sides": "both eyes' u rose alike, and the command did not turn",
+    "turned the other way": "the command turned against the rule's label",
+    "turned too late": "the command did not turn the wrong way, but too little or too late",
+}
+"""Name and meaning of each cause."""
+
+WINDOW = 2.5  # s before the contact: three gait cycles, in which a hard turn rotates the robot by 40 degrees
+CLEAR_DISTANCE = 1.2  # m; with nothing nearer, nothing counts as near: the rule starts to turn at 0.8 m
+QUIET_QUANTILE = 0.99  # of u with nothing near; 1 of 5 to 14 windows with nothing near exceed it (0.95: 1 of 3)
+TURN_BANDS = (0.3, 1.0, 2.0)  # nominal; bounds of |v_r - v_l|, between which the baseline of u is constant
+MIN_QUIET_TIME = 10.0  # s of walking with nothing near that the baseline needs
+MIN_BAND_TIME = 3.0  # s of it that the baseline of one band needs
+MIN_DIFFERENCE = 0.5  # in units of difference_std; exceeded in 1 of 10 frames of straight walks, 3 of 4 of hard turns
+MIN_TURN = float(braitenberg.Params().turn_deadband)  # nominal; a smaller |v_r - v_l| counts as no turn, as in the rule
+SIDE_REACH = 0.05  # m; middle legs, which step 4 cm, touch no farther ahead or behind: neither front nor tail
+NEAR_DISTANCE = float(braitenberg.Params().full_turn_distance)  # m; nearer than this the rule turns as hard as it can
+MIN_SIDE_BEARING = 0.35  # rad; at a smaller bearing it is ahead: half a robot at 0.5 m subtends 0.4 rad
+MAX_SIDE_BEARING = 0.5 * laser.Params().fov  # rad; at a greater bearing the robot doesn't walk into it
+_CYCLE = round(AVERAGING_TIME * FRAME_RATE)  # frames
 
 
 @dataclass(frozen=True, kw_only=True)
-class Yardstick:
-    """What u is on walks, to measure by what it was before a touch."""
+class QuietBaseline:
+    """Levels of u with nothing near, against which u before a contact is compared."""
 
-    quiet: tuple[float, ...]  # u seldom surpassed with nothing near, in each of the bands of turning
-    spread: float  # standard deviation of u_l - u_r
+    u_levels: tuple[float, ...]  # quantile `QUIET_QUANTILE` of u with nothing near, in each band of turning
+    difference_std: float  # standard deviation of u_l - u_r
 
 
 @dataclass(frozen=True, kw_only=True)
 class Collision:
-    """One touch, and what led to it in the window before."""
+    """One collision, and u, command and label in the window before."""
 
     robot: int
     frame: int
-    limb: str  # what touched, a name of `hexapod.CAPSULES`
-    point: tuple[float, float]  # m, where on the robot, seen from above: ahead of the trunk's centre, to its left
-    thing: str  # what was touched: box, wall or cylinder
-    cornered: bool  # near at once to it and to something on the other side
-    rise: float  # greatest u over that with nothing near
-    difference: float  # greatest |u_l - u_r|, in spreads
-    turn: float  # mean v_r - v_l of the command
-    asked: float  # mean v_r - v_l of the label
+    limb: str  # that touched, a name of `hexapod.CAPSULES`
+    point: tuple[float, float]  # m, on the robot, seen from above: ahead of the trunk's centre, to its left
+    obstacle: str  # that was touched: box, wall or cylinder
+    in_corner: bool  # another obstacle was near on the other side at the same time
+    u_rise: float  # maximum of u minus its baseline
+    u_difference: float  # maximum of |u_l - u_r|, in units of difference_std
+    command_turn: float  # mean v_r - v_l of the command
+    label_turn: float  # mean v_r - v_l of the label
 
     @property
     def bearing(self) -> float:
-        """Tell in which direction from the trunk's centre it touched [rad], positive to the left."""
+        """Return the bearing [rad] of the contact from the trunk's centre, positive to the left."""
         return float(np.arctan2(self.point[1], self.point[0]))
 
     @property
     def part(self) -> str:
-        """Tell which part of the robot touched: front, side or tail."""
+        """Return the part of the robot that touched: front, side or tail."""
         ahead = self.point[0]
-        return "front" if ahead > MIDDLE else "tail" if ahead < -MIDDLE else "side"
+        return "front" if ahead > SIDE_REACH else "tail" if ahead < -SIDE_REACH else "side"
 
     @property
-    def kind(self) -> str:
-        """Tell which of `KINDS` it is."""
+    def cause(self) -> str:
+        """Return the cause, a key of `CAUSES`."""
         if self.part == "tail":
             return "tail swing"
-        if self.cornered:
+        if self.in_corner:
             return "corner"
-        if self.rise <= 0:
+        if self.u_rise <= 0:
             return "did not see"
-        if self.difference < TELLS and abs(self.turn) <= STEADY:
+        if self.u_difference < MIN_DIFFERENCE and abs(self.command_turn) <= MIN_TURN:
             return "saw both sides"
-        if self.turn * self.asked < 0 and min(abs(self.turn), abs(self.asked)) > STEADY:
+        if self.command_turn * self.label_turn < 0 and min(abs(self.command_turn), abs(self.label_turn)) > MIN_TURN:
             return "turned the other way"
         return "turned too late"
 
 
-def find(record: Record, arenas: arena.Arena, yardstick: Yardstick | None = None) -> list[Collision]:
-    """Take walks apart at every collision, in the order of robots and frames.
+class _Place(NamedTuple):
+    """Where on the robot a contact was, and with what."""
+
+    limb: str
+    point: tuple[float, float]
+    obstacle: str
+    in_corner: bool
+
+
+def classify(record: Record, arenas: arena.Arena, baseline: QuietBaseline | None = None) -> list[Collision]:
+    """Describe every collision of recorded walks, in the order of robots and frames; each knows its `cause`.
 
     Args:
         record: walks, axes (robot, frame).
         arenas: the robots' rooms, with a leading axis of robots.
-        yardstick: of other walks of the same robot, where these are too few; their own (`measure`) if None.
+        baseline: fitted to other walks of the same robot; by default fitted to these walks (`fit_baseline`).
     """
-    hits = np.argwhere(np.asarray(record.contact) & np.asarray(record.ok))
-    if not len(hits):
+    found = np.argwhere(np.asarray(record.contact) & np.asarray(record.ok))
+    if not len(found):
         return []
-    yardstick = yardstick or measure(record)
-    u, age = averaged(record), _age(record)
-    rise = u - np.asarray(yardstick.quiet)[_band(record)][..., None]
-    difference = np.abs(u[..., 0] - u[..., 1]) / yardstick.spread
-    turn, asked = _turn(record.velocity), _turn(record.label)
-    found = []
-    for robot, frame in hits.tolist():
+    baseline = baseline or fit_baseline(record)
+    u, age = average_over_cycle(record), _frames_since_reset(record)
+    rise = u - np.asarray(baseline.u_levels)[_turn_band(record)][..., None]
+    difference = np.abs(u[..., 0] - u[..., 1]) / baseline.difference_std
+    command_turn, label_turn = _turn(record.velocity), _turn(record.label)
+    collisions = []
+    for robot, frame in found.tolist():
         first = frame - min(round(WINDOW * FRAME_RATE) - 1, int(age[robot, frame]))
-        rows = robot, slice(first, frame + 1)
-        found.append(
+        window = robot, slice(first, frame + 1)
+        collisions.append(
             Collision(
                 robot=robot,
                 frame=frame,
-                **_place(_cut(record, rows), _cut(arenas, robot)),
-                rise=float(rise[rows].max()),
-                difference=float(difference[rows].max()),
-                turn=float(turn[rows].mean()),
-                asked=float(asked[rows].mean()),
+                **_locate(_index(record, window), _index(arenas, robot))._asdict(),
+                u_rise=float(rise[window].max()),
+                u_difference=float(difference[window].max()),
+                command_turn=float(command_turn[window].mean()),
+                label_turn=float(label_turn[window].mean()),
             )
         )
-    return found
+    return collisions
 
 
-def count(collisions: Sequence[Collision]) -> dict[str, int]:
-    """Count the collisions of each kind, the kinds without any too."""
-    kinds = [collision.kind for collision in collisions]
-    return {kind: kinds.count(kind) for kind in KINDS}
+def count_causes(collisions: Sequence[Collision]) -> dict[str, int]:
+    """Count the collisions of each cause, including causes without any."""
+    causes = [collision.cause for collision in collisions]
+    return {cause: causes.count(cause) for cause in CAUSES}
 
 
-def measure(record: Record) -> Yardstick:
-    """Find what u is with nothing near, and how far the eyes differ, on walks with axes (robot, frame).
+def fit_baseline(record: Record) -> QuietBaseline:
+    """Fit the baseline of u to the frames of walks with nothing near; axes (robot, frame).
 
-    Where hardly any robot turned as hard as that with nothing near, u is taken to be that of the next gentler band.
+    A band of turning with too few such frames gets the level of the next gentler band.
 
     Raises InputError if there is too little walking with nothing near.
     """
-    u, band = averaged(record), _band(record)
-    sound = np.asarray(record.ok) & (_age(record) >= _CYCLE)
-    far = sound & np.all(np.asarray(record.distances) > FAR, axis=-1)
-    if far.sum() < LEAST * FRAME_RATE:
+    u, band = average_over_cycle(record), _turn_band(record)
+    valid = np.asarray(record.ok) & (_frames_since_reset(record) >= _CYCLE)
+    quiet = valid & np.all(np.asarray(record.distances) > CLEAR_DISTANCE, axis=-1)
+    if quiet.sum() < MIN_QUIET_TIME * FRAME_RATE:
         raise InputError(
-            f"collisions: expected {LEAST:.0f} s or more with nothing within {FAR} m, got "
-            f"{far.sum() / FRAME_RATE:.1f} s; give the yardstick of other walks of this robot"
+            f"collision_causes: expected {MIN_QUIET_TIME:.0f} s or more with nothing within {CLEAR_DISTANCE} m, got "
+            f"{quiet.sum() / FRAME_RATE:.1f} s; give the baseline of other walks of this robot"
         )
-    level, quiet = float(np.quantile(u[far], RISEN)), []
-    for number in range(len(BANDS) + 1):
-        here = far & (band == number)
-        level = float(np.quantile(u[here], RISEN)) if here.sum() >= LEAST_OF_BAND * FRAME_RATE else level
-        quiet.append(level)
-    # Eyes that never differ tell no side; with a spread of nothing their rounding would.
-    spread = max(float(np.std((u[..., 0] - u[..., 1])[sound])), 1e-6)
-    return Yardstick(quiet=tuple(quiet), spread=spread)
+    level, levels = float(np.quantile(u[quiet], QUIET_QUANTILE)), []
+    for number in range(len(TURN_BANDS) + 1):
+        in_band = quiet & (band == number)
+        level = float(np.quantile(u[in_band], QUIET_QUANTILE)) if in_band.sum() >= MIN_BAND_TIME * FRAME_RATE else level
+        levels.append(level)
+    # If both u are always equal, a deviation of zero would make rounding errors count as differences.
+    difference_std = max(float(np.std((u[..., 0] - u[..., 1])[valid])), 1e-6)
+    return QuietBaseline(u_levels=tuple(levels), difference_std=difference_std)
 
 
-def averaged(record: Record) -> Float[ndarray, "robots frames 2"]:
-    """Average u over the gait cycle that ends with each frame, as if a stretch's first frame had lasted for one."""
-    return _trailing(np.asarray(record.u, float), record)
+def average_over_cycle(record: Record) -> Float[ndarray, "robots frames 2"]:
+    """Average u over the gait cycle that ends with each frame; the first frame of a segment is repeated before it."""
+    return _trailing_mean(np.asarray(record.u, float), record)
 
 
-def _trailing(series: ndarray, record: Record) -> ndarray:
-    """Average (robot, frame, ...) over the gait cycle that ends with each frame, not across a set-back."""
+def _trailing_mean(series: ndarray, record: Record) -> ndarray:
+    """Average a series (robot, frame, ...) over the gait cycle that ends with each frame, but not across a reset."""
     means, backward = np.empty_like(series), (_CYCLE - 1) // 2
-    for robot, first, end in metrics.stretches(np.asarray(record.setbacks)):
-        stretch = series[robot, first:end]
-        means[robot, first:end] = ndimage.uniform_filter1d(stretch, _CYCLE, axis=0, mode="nearest", origin=backward)
+    for robot, first, end in metrics.segment_bounds(np.asarray(record.resets)):
+        segment = series[robot, first:end]
+        means[robot, first:end] = ndimage.uniform_filter1d(segment, _CYCLE, axis=0, mode="nearest", origin=backward)
     return means
 
 
-def _turn(velocity: Any) -> Float[ndarray, "robots frames"]:
+def _turn(velocity: Float[AnyArray, "robots frames 2"]) -> Float[ndarray, "robots frames"]:
     left, right = np.moveaxis(np.asarray(velocity, float), -1, 0)
     return right - left
 
 
-def _band(record: Record) -> Int[ndarray, "robots frames"]:
-    """Tell in which of the bands the robot turned in the gait cycle that ends with each frame."""
-    return np.searchsorted(BANDS, _trailing(np.abs(_turn(record.velocity)), record))
+def _turn_band(record: Record) -> Int[ndarray, "robots frames"]:
+    """Return the number of the band of mean |v_r - v_l| in the gait cycle that ends with each frame."""
+    return np.searchsorted(TURN_BANDS, _trailing_mean(np.abs(_turn(record.velocity)), record))
 
 
-def _age(record: Record) -> Int[ndarray, "robots frames"]:
-    """Count the frames since the robot was put down."""
-    age = np.empty(np.shape(record.setbacks), int)
-    for robot, first, end in metrics.stretches(np.asarray(record.setbacks)):
+def _frames_since_reset(record: Record) -> Int[ndarray, "robots frames"]:
+    """Count the frames since the robot's last reset."""
+    age = np.empty(np.shape(record.resets), int)
+    for robot, first, end in metrics.segment_bounds(np.asarray(record.resets)):
         age[robot, first:end] = np.arange(end - first)
     return age
 
 
-def _cut(batch: Any, rows: Any) -> Any:
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[rows], batch)
+def _index(batch: _Tree, index: int | tuple[int, slice]) -> _Tree:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], batch)
 
 
-def _place(walk: Record, room: arena.Arena) -> dict[str, Any]:
-    """Find where on the robot it touched what, and whether it was in a corner, in the last frame of a walk."""
-    around = [contacts.surfaces(room, float(time)) for time in walk.time]
-    touch = contacts.touch(walk, around[-1])
+def _locate(walk: Record, room: arena.Arena) -> _Place:
+    """Locate the contact in the last frame of a walk, and check whether the robot was in a corner."""
+    surfaces = [contacts.touchable_surfaces(room, float(time)) for time in walk.time]
+    contact = contacts.locate_contact(walk, surfaces[-1])
     centres = np.asarray(walk.position, float)[:, None, :2]
-    points = np.concatenate([contacts.nearest(*pair) for pair in zip(around, centres, strict=True)])
-    return {
-        "limb": touch.limb,
-        "point": (float(touch.point[0]), float(touch.point[1])),
-        "thing": around[-1].names[touch.surface],
-        "cornered": bool(np.any(_cornered(walk, points, touch.surface))),
-    }
+    points = np.concatenate([contacts.nearest_points(*pair) for pair in zip(surfaces, centres, strict=True)])
+    return _Place(
+        limb=contact.limb,
+        point=(float(contact.point[0]), float(contact.point[1])),
+        obstacle=surfaces[-1].kinds[contact.surface],
+        in_corner=bool(np.any(_is_in_corner(walk, points, contact.surface))),
+    )
 
 
-def _cornered(walk: Record, points: Float[ndarray, "frames surfaces 2"], touched: int) -> Bool[ndarray, " frames"]:
-    """Tell in which frames the nearest point of what was touched, and one of something else, were near on two sides."""
+def _is_in_corner(walk: Record, points: Float[ndarray, "frames surfaces 2"], touched: int) -> Bool[ndarray, " frames"]:
+    """Find the frames in which the touched surface and another one were near on opposite sides of the robot."""
     position, quaternion = (np.asarray(pose, float)[:, None] for pose in (walk.position, walk.quaternion))
-    ahead, left = np.moveaxis(contacts.seen(position, quaternion, points), -1, 0)
+    ahead, left = np.moveaxis(contacts.to_body_frame(position, quaternion, points), -1, 0)
     bearing = np.arctan2(left, ahead)
-    beside = (np.hypot(ahead, left) < NEAR) & (np.abs(bearing) > BESIDE) & (np.abs(bearing) < ABEAM)
-    side = np.sign(bearing) * beside
+    beside = (np.abs(bearing) > MIN_SIDE_BEARING) & (np.abs(bearing) < MAX_SIDE_BEARING)
+    side = np.sign(bearing) * ((np.hypot(ahead, left) < NEAR_DISTANCE) & beside)
     return np.any(side * side[:, touched, None] < 0, axis=1)

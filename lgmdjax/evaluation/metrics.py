@@ -1,11 +1,16 @@
-"""How walks are scored: distance, collisions per 100 m, clearance, each with a 95 % interval.
+"""Metrics of recorded walks: distance, collisions per 100 m, clearance, each with a 95 % interval.
 
-Distance is the path of the trunk's centre, averaged over one gait cycle so that sway does not count, and not
-across the gap when the robot was set back. A collision is a frame in which the least clearance reached zero;
-the robot is then set back, so each touch counts once. Rates of collisions are Poisson counts over a distance;
-their interval is exact (Garwood 1936), and clearances and distances are bootstrapped over robots.
+Distance is the path length of the trunk's centre. The path is averaged over one gait cycle, so that sway doesn't count,
+and is interrupted at resets. A collision is a frame in which the clearance reached zero. The robot is then reset, so
+each contact counts once.
 
-Works on host records (`rollout.chunks`) with axes (robot, frame).
+| quantity                       | interval                                     |
+| ------------------------------ | -------------------------------------------- |
+| collisions per 100 m           | exact, of a Poisson count (Garwood 1936)     |
+| proportion of trials           | Wilson's (Wilson 1927)                       |
+| mean clearance, mean distance  | percentile bootstrap over robots             |
+
+Works on host records (`rollout.rollout_chunks`) with axes (robot, frame).
 """
 
 from collections.abc import Iterator
@@ -13,17 +18,26 @@ from itertools import pairwise
 
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from scipy import ndimage, stats
 
+from lgmdjax import geometry
 from lgmdjax.errors import InputError
+from lgmdjax.locomotion import cpg
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
 
 CONFIDENCE = 0.95
+AVERAGING_TIME = cpg.CYCLE_TIME  # s; u and the commands are averaged over one gait cycle
 
 
 @struct.dataclass(kw_only=True)
 class Estimate:
-    """A number and the interval that holds it at 95 %."""
+    """An estimate and its 95 % interval.
+
+    >>> print(Estimate(value=2.22, low=0.269, high=8.03))
+    2.22 [0.269, 8.03]
+    """
 
     value: float
     low: float
@@ -35,95 +49,108 @@ class Estimate:
 
 @struct.dataclass(kw_only=True)
 class Score:
-    """What one driver did over a set of walks."""
+    """Metrics of a batch of walks with one policy."""
 
     robots: int
-    lost: int  # robots frozen because they fell or went non-finite
-    distance: float  # m, all together
+    lost: int  # robots that were frozen because they fell or their state became non-finite
+    distance: float  # m, total of all robots
     collisions: int
     per_100_m: Estimate  # collisions per 100 m
-    first_collision: Estimate  # m walked until the first touch, or to the end where there was none
-    clearance: Estimate  # m, the mean over frames of the least clearance in a frame
+    first_collision: Estimate  # m walked until the first collision, or until the end if there was none
+    clearance: Estimate  # m, mean over frames of the smallest clearance within the frame
     speed: float  # m/s, path length over time
     turning: float  # rad/s, mean absolute yaw rate
 
 
-def score(record: Record, cycle_time: float) -> Score:
-    """Score a batch of walks; frames of a robot that is no longer sound count for nothing."""
-    sound = np.asarray(record.ok)
-    touches = np.asarray(record.contact) & sound
+def score(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Score:
+    """Compute the metrics of a batch of walks; a robot's frames after it was lost (`ok` false) don't count.
+
+    Args:
+        record: recorded walks, axes (robot, frame).
+        cycle_time: duration of one gait cycle [s], over which paths and headings are averaged.
+
+    Raises InputError if no robot moved.
+    """
+    ok = np.asarray(record.ok)
+    contacts = np.asarray(record.contact) & ok
     steps = step_lengths(record, cycle_time)
-    distance, collisions = float(steps.sum()), int(touches.sum())
+    distance, collisions = float(steps.sum()), int(contacts.sum())
     if distance <= 0:
         raise InputError("expected a walk with some distance in it, got none; did every robot fall at once?")
-    clearance = np.where(sound, record.clearance, np.nan)
+    clearance = np.where(ok, record.clearance, np.nan)
     return Score(
-        robots=len(sound),
-        lost=int((~sound[:, -1]).sum()),
+        robots=len(ok),
+        lost=int((~ok[:, -1]).sum()),
         distance=distance,
         collisions=collisions,
         per_100_m=poisson_rate(collisions, distance / 100),
-        first_collision=bootstrap_mean(_first_collision(steps, touches)),
+        first_collision=bootstrap_mean(_distance_to_first_collision(steps, contacts)),
         clearance=bootstrap_mean(np.nanmean(clearance, axis=1)),
-        speed=distance * FRAME_RATE / int(sound.sum()),
-        turning=float(np.mean(np.abs(yaw_rates(record, cycle_time))[sound])),
+        speed=distance * FRAME_RATE / int(ok.sum()),
+        turning=float(np.mean(np.abs(yaw_rates(record, cycle_time))[ok])),
     )
 
 
-def step_lengths(record: Record, cycle_time: float) -> np.ndarray:
-    """Measure the way of the smoothed trunk centre from each frame to the next [m], zero across a set-back.
+def step_lengths(record: Record, cycle_time: float) -> Float[ndarray, "robots frames"]:
+    """Compute the distance [m] from each frame to the next along the averaged path, zero across a reset.
 
-    Shape (robots, frames); the last frame of a stretch has no next one and counts zero.
+    The last frame of a segment has no next frame and is zero.
     """
-    positions, setbacks = np.asarray(record.position), np.asarray(record.setbacks)
-    sound = np.asarray(record.ok)
-    lengths = np.zeros(setbacks.shape)
-    for robot, first, last in stretches(setbacks):
-        path = _smooth(positions[robot, first:last, :2], cycle_time)
-        lengths[robot, first : last - 1] = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    return np.where(sound, lengths, 0.0)
+    positions, resets, ok = np.asarray(record.position), np.asarray(record.resets), np.asarray(record.ok)
+    lengths = np.zeros(resets.shape)
+    for robot, first, end in segment_bounds(resets):
+        path = _average_over_cycle(positions[robot, first:end, :2], cycle_time)
+        lengths[robot, first : end - 1] = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return np.where(ok, lengths, 0.0)
 
 
-def yaw_rates(record: Record, cycle_time: float) -> np.ndarray:
-    """Measure the yaw rate of the trunk, averaged over one gait cycle [rad/s]; shape (robots, frames)."""
-    yaw, setbacks = np.unwrap(yaws(np.asarray(record.quaternion)), axis=1), np.asarray(record.setbacks)
-    rates = np.zeros(yaw.shape)
-    for robot, first, last in stretches(setbacks):
-        if last - first > 1:
-            rates[robot, first:last] = np.gradient(_smooth(yaw[robot, first:last], cycle_time)) * FRAME_RATE
+def yaw_rates(record: Record, cycle_time: float) -> Float[ndarray, "robots frames"]:
+    """Compute the yaw rate [rad/s] of the trunk, averaged over one gait cycle, positive to the left."""
+    headings = np.unwrap(geometry.yaw(np.asarray(record.quaternion, dtype=float)), axis=1)
+    rates = np.zeros(headings.shape)
+    for robot, first, end in segment_bounds(np.asarray(record.resets)):
+        if end - first > 1:
+            averaged = _average_over_cycle(headings[robot, first:end], cycle_time)
+            rates[robot, first:end] = np.gradient(averaged) * FRAME_RATE
     return rates
 
 
-def yaws(quaternion: np.ndarray) -> np.ndarray:
-    """Read the heading [rad] off quaternions w x y z."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+def segment_bounds(resets: Int[ndarray, "robots frames"]) -> Iterator[tuple[int, int, int]]:
+    """Yield (robot, first frame, end frame) of every segment of walking without a reset.
 
-
-def stretches(setbacks: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """Yield (robot, first frame, end frame) of every uninterrupted stretch of walking."""
-    for robot, count in enumerate(setbacks):
-        cuts = np.flatnonzero(np.diff(count)) + 1
-        bounds = [0, *cuts.tolist(), len(count)]
-        yield from ((robot, first, last) for first, last in pairwise(bounds))
+    >>> list(segment_bounds(np.array([[0, 0, 0, 1, 1]])))
+    [(0, 0, 3), (0, 3, 5)]
+    """
+    for robot, count in enumerate(resets):
+        starts = np.flatnonzero(np.diff(count)) + 1
+        bounds = [0, *starts.tolist(), len(count)]
+        yield from ((robot, first, end) for first, end in pairwise(bounds))
 
 
 def poisson_rate(count: int, exposure: float) -> Estimate:
-    """Estimate a rate from a count over an exposure, with the exact interval (Garwood 1936)."""
+    """Estimate a rate from a count over an exposure, with the exact interval (Garwood 1936).
+
+    >>> print(poisson_rate(2, 0.9))  # two collisions in 90 m: rate per 100 m
+    2.22 [0.269, 8.03]
+    """
     tail = (1 - CONFIDENCE) / 2
     low = stats.chi2.ppf(tail, 2 * count) / 2 if count else 0.0
     high = stats.chi2.ppf(1 - tail, 2 * (count + 1)) / 2
     return Estimate(value=count / exposure, low=float(low) / exposure, high=float(high) / exposure)
 
 
-def wilson(count: int, trials: int) -> Estimate:
-    """Estimate a share from a count of trials, with Wilson's interval (Wilson 1927)."""
+def wilson_proportion(count: int, trials: int) -> Estimate:
+    """Estimate a proportion from a count of trials, with Wilson's interval (Wilson 1927).
+
+    >>> print(wilson_proportion(15, 15))  # the paper's trials with one obstacle, all without contact
+    1 [0.796, 1]
+    """
     interval = stats.binomtest(count, trials).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(value=count / trials, low=float(interval.low), high=float(interval.high))
 
 
-def bootstrap_mean(values: np.ndarray) -> Estimate:
-    """Estimate a mean over robots, with a percentile bootstrap; one robot alone has no interval (nan)."""
+def bootstrap_mean(values: Float[ndarray, " robots"]) -> Estimate:
+    """Estimate a mean over robots with a percentile bootstrap; the interval of a single robot is nan."""
     values = np.asarray(values)
     if len(values) < 2:
         return Estimate(value=float(values.mean()), low=float("nan"), high=float("nan"))
@@ -135,16 +162,15 @@ def bootstrap_mean(values: np.ndarray) -> Estimate:
     return Estimate(value=float(values.mean()), low=float(interval.low), high=float(interval.high))
 
 
-def _smooth(path: np.ndarray, cycle_time: float) -> np.ndarray:
-    """Average over one gait cycle; the ends repeat, which shortens a stretch by at most half a cycle."""
-    return ndimage.uniform_filter1d(path, round(cycle_time * FRAME_RATE), axis=0, mode="nearest")
+def _average_over_cycle(series: Float[ndarray, "frames *components"], cycle_time: float) -> ndarray:
+    """Average over one gait cycle; the end values are repeated, which shortens a path by at most half a cycle."""
+    return ndimage.uniform_filter1d(series, round(cycle_time * FRAME_RATE), axis=0, mode="nearest")
 
 
-def _first_collision(steps: np.ndarray, touches: np.ndarray) -> np.ndarray:
-    """Measure each robot's way to its first touch [m]; its whole way where it never touched (a lower bound)."""
-    walked = np.cumsum(steps, axis=1)
-    first = np.where(touches.any(axis=1), touches.argmax(axis=1), touches.shape[1] - 1)
-    return np.take_along_axis(walked, first[:, None], axis=1)[:, 0]
-
-
-AVERAGED = 0.8  # s, about a gait cycle
+def _distance_to_first_collision(
+    steps: Float[ndarray, "robots frames"], contacts: Bool[ndarray, "robots frames"]
+) -> Float[ndarray, " robots"]:
+    """Return each robot's distance [m] to its first collision; its total distance (a lower bound) if it had none."""
+    distance = np.cumsum(steps, axis=1)
+    first = np.where(contacts.any(axis=1), contacts.argmax(axis=1), contacts.shape[1] - 1)
+    return np.take_along_axis(distance, first[:, None], axis=1)[:, 0]

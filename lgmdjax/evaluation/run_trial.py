@@ -1,102 +1,158 @@
-"""`lgmdjax trial`: one of the paper's experiments with one driver, walked, judged, drawn and filmed.
+"""Run one trial with one policy: simulate, evaluate, plot and make a video (`lgmdjax trial`).
 
-Leaves, in a folder of the trial's, the driver's and the seed's name: `outcome.json`, `chunk-*.parquet` (the walks of a
-crowd each, see `lgmdjax.simulation.episodes`), `paths.png` (from above) and `walk.mp4` (the liveliest stretch of one
-robot). Interrupted, the same command carries on with the crowd that it was at.
+The results are in a folder with the names of the trial, the policy and the seed:
+
+| file            | content                                                              |
+| --------------- | -------------------------------------------------------------------- |
+| outcome.json    | the outcome (`summarise`)                                            |
+| chunk-*.parquet | the recorded walks of one batch each (`lgmdjax.simulation.episodes`) |
+| paths.png       | paths seen from above                                                |
+| walk.mp4        | video of the most eventful walk                                      |
+
+After an interruption the same call continues with the next batch.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
 from lgmdjax.control import policies
+from lgmdjax.control.names import PolicyName
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import metrics, trials
-from lgmdjax.locomotion import cpg
+from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.reporting import walk_video
 from lgmdjax.reporting.figures import style, trajectories
 from lgmdjax.runtime import storage
 from lgmdjax.runtime.run_folders import Stage, execute, open_run
-from lgmdjax.sensors import camera
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, recording
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena
 
-FILM = 15.0  # s
-ROOMS_DRAWN = 6
-DRIVERS = {driver.name: driver for driver in policies.ALL}
+VIDEO_SECONDS = 15.0  # s
+MAX_PANELS = 6  # rooms in the plot of a trial in which robots walk on after a contact
+POLICY_BY_NAME = {policy.name: policy for policy in policies.POLICIES}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Attempt:
-    """Who walks what, how often, and for how long at most."""
+class TrialRun:
+    """A trial with one policy of one robot."""
 
-    trial: str
-    driver: str
-    seeds: int
-    seconds: float
-    robot: str  # digest of all its numbers
+    trial: TrialName
+    policy: PolicyName
+    seeds: int  # number of repetitions
+    seconds: float  # longest duration of a walk
+    robot: str  # fingerprint of the robot's parameters
+
+    def parameters(self) -> JsonObject:
+        """Return the values that identify the recorded walks, with their names on disk."""
+        return {
+            "trial": self.trial,
+            "driver": self.policy,
+            "seeds": self.seeds,
+            "seconds": self.seconds,
+            "robot": self.robot,
+        }
 
 
-def attempt(
-    name: str, driver: str, *, seed: int, seeds: int | None, width: int | None, run: Path | None, out: Path
+def run_trial(
+    trial: TrialName,
+    policy: PolicyName = "learned",
+    *,
+    seed: int = 0,
+    seeds: int | None = None,
+    width: int | None = None,
+    run: Path | None = None,
+    out: Path = Path("runs/trials"),
 ) -> Path:
-    """Walk a trial and give the folder of its files.
+    """Run a trial and return the folder with its results; finished trials are not repeated.
 
     Args:
-        name: of the trial. driver: who walks. seed: of rooms, textures and starts.
-        seeds: how often; as often as the trial says if None.
-        width: of the pictures, whose cells go on looking at as many degrees [px]; as it learned with if None.
-        run: the run folder whose robot walks; the one that comes with the package if None.
-        out: the folder to write a folder into.
+        trial: name of the trial (`trials.TRIALS`).
+        policy: name of the policy.
+        seed: of rooms, textures and start poses.
+        seeds: number of repetitions; by default as many as the trial says.
+        width: of the eyes' pictures [px], by default as in training; the LGMD's cells cover the same angle at any.
+        run: run folder of the robot; by default the pretrained robot.
+        out: folder in which the folder with the results is created.
+
+    Raises InputError for an unknown name, an impossible number or width, and a folder with results of other settings.
+
+    ```python
+    folder = lgmdjax.run_trial("indoor", "learned", seeds=2)
+    print((folder / "outcome.json").read_text())
+    ```
     """
+    _check(trial, policy, seeds)
+    robot = assembly.load_robot(run / "fit-gait", run / "train") if run else assembly.load_robot()
+    robot = robot if width is None else assembly.with_camera(robot, _scale_camera(robot, width))
+    definition = trials.TRIALS[trial]
+    trial_run = describe_run(robot, trial, policy, seeds or definition.seeds, definition.seconds)
+
+    def work(folder: Path, inputs: Mapping[str, Path], settings: JsonObject, seed: int) -> None:
+        _write_results(folder, trial_run, robot, seed)
+
+    place = open_run(out, f"{trial}-{policy}-{seed}", "trial", seed, {"trial": trial_run.parameters()})
+    return execute(place, (Stage(name="trial", run=work),), "trial")
+
+
+def _check(trial: str, policy: str, seeds: int | None) -> None:
+    for kind, name, known in (("trial", trial, trials.TRIALS), ("policy", policy, POLICY_BY_NAME)):
+        if name not in known:
+            raise InputError(f"expected the name of a {kind}, got {name!r}; choose one of {', '.join(known)}")
     if seeds is not None and seeds < 1:
         raise InputError(f"expected one or more --seeds, got {seeds}; leave it out for as many as the paper has")
-    robot = assembly.trained(run / "fit-gait", run / "train") if run else assembly.trained()
-    robot = robot if width is None else assembly.with_eyes(robot, _eyes(robot, width))
-    trial = trials.TRIALS[name]
-    asked = tried(robot, name, driver, seeds or trial.seeds, trial.seconds)
-    place = open_run(out, f"{name}-{driver}-{seed}", "trial", seed, {"trial": asked})
-    return execute(place, (Stage(name="trial", work=partial(_work, robot)),), "trial")
 
 
-def _eyes(robot: closed_loop.Params, width: int) -> CameraSettings:
-    """Find eyes with pictures of another width and cells of the same size in degrees."""
-    eyes, pooling = robot.camera, robot.controller.lgmd.pooling
-    if width < 1 or (pooling * width) % eyes.width or (eyes.height * width) % eyes.width:
+def _scale_camera(robot: closed_loop.Params, width: int) -> CameraSettings:
+    """Return camera settings with pictures of another width and LGMD cells of the same size in degrees."""
+    camera, pooling = robot.camera, robot.controller.lgmd.pooling
+    if width < 1 or (pooling * width) % camera.width or (camera.height * width) % camera.width:
         raise InputError(
-            f"expected a --width whose cells are whole pixels as the {pooling} of {eyes.width} are, got {width}; "
-            f"try {2 * eyes.width}"
+            f"expected a --width whose cells are whole pixels as the {pooling} of {camera.width} are, got {width}; "
+            f"try {2 * camera.width}"
         )
-    height, cell = eyes.height * width // eyes.width, pooling * width // eyes.width
-    return CameraSettings(width=width, height=height, overlap=eyes.overlap, pooling=cell)
+    height, cell = camera.height * width // camera.width, pooling * width // camera.width
+    return CameraSettings(width=width, height=height, overlap=camera.overlap, pooling=cell)
 
 
-def tried(robot: closed_loop.Params, trial: str, driver: str, seeds: int, seconds: float) -> Attempt:
-    """Say what is tried with a robot."""
-    return Attempt(trial=trial, driver=driver, seeds=seeds, seconds=seconds, robot=assembly.digest(robot))
+def describe_run(
+    robot: closed_loop.Params, trial: TrialName, policy: PolicyName, seeds: int, seconds: float
+) -> TrialRun:
+    """Describe a trial with one policy of a robot; robots with other parameters have another description."""
+    return TrialRun(trial=trial, policy=policy, seeds=seeds, seconds=seconds, robot=assembly.fingerprint(robot))
 
 
-def walk(folder: Path, tried: Attempt, robot: closed_loop.Params, seed: int) -> tuple[Room, Record]:
-    """Walk a trial crowd by crowd, after those that are in the folder already; give its rooms and all walks."""
-    rooms = trials.draw_rooms(tried.trial, tried.seeds, seed)
-    record = recording.walked(
-        folder, robot, rooms, tried.seconds, DRIVERS[tried.driver], seed=seed, facts=asdict(tried), label=tried.trial
+def record_trial(folder: Path, trial_run: TrialRun, robot: closed_loop.Params, seed: int) -> tuple[Room, Record]:
+    """Simulate a trial batch by batch and record the walks; return rooms and walks.
+
+    Batches that are already in the folder are not simulated again.
+    """
+    rooms = trials.sample_rooms(trial_run.trial, trial_run.seeds, seed)
+    record = recording.record_rollouts(
+        folder,
+        robot,
+        rooms,
+        trial_run.seconds,
+        POLICY_BY_NAME[trial_run.policy],
+        seed=seed,
+        parameters=trial_run.parameters(),
+        label=trial_run.trial,
     )
     return rooms, record
 
 
-def summary(trial: trials.Trial, record: Record) -> dict[str, Any]:
-    """Sum up a trial: the share that stayed untouched, or collisions per 100 m where robots walk on after a touch."""
-    if not trial.ends:
-        return asdict(metrics.score(record, cpg.CYCLE_TIME))
-    outcome = trials.judge(trial, record)
+def summarise(trial: trials.Trial, record: Record) -> JsonObject:
+    """Summarise a trial: outcomes of all robots, or the score if robots walk on after a contact."""
+    if not trial.ends_at_contact:
+        return asdict(metrics.score(record))
+    outcome = trials.find_outcome(trial, record)
     return {
         "robots": len(outcome.touched),
         "untouched": int((~outcome.touched).sum()),
@@ -108,35 +164,27 @@ def summary(trial: trials.Trial, record: Record) -> dict[str, Any]:
     }
 
 
-def draw(trial: trials.Trial, rooms: Room, record: Record) -> style.Figure:
-    """Draw what was walked, from above, every room the way round that the paper has it."""
+def plot_trial(trial: trials.Trial, rooms: Room, record: Record) -> Figure:
+    """Plot the paths of a trial seen from above; mirrored rooms are mirrored back, to the paper's orientation."""
     arenas = [jax.tree.map(lambda leaf, robot=robot: leaf[robot], rooms.arena) for robot in range(len(record.time))]
-    hands = np.asarray(rooms.arena.handedness)
-    paths = np.asarray(record.position)[..., :2] * np.stack([np.ones_like(hands), hands], axis=1)[:, None]
-    upright = [arena.mirror(room) if hand < 0 else room for room, hand in zip(arenas, hands, strict=True)]
-    if not trial.ends:
-        drawn = upright[:ROOMS_DRAWN]
-        series = paths, np.asarray(record.setbacks), np.asarray(record.contact)
-        walks = [trajectories.Walks(*(x[[k]] for x in series)) for k in range(len(drawn))]
-        return trajectories.rooms(drawn, walks)
-    outcome = trials.judge(trial, record)
-    ways = [path[:end] for path, end in zip(paths, outcome.frames, strict=True)]
-    across = np.resize(np.repeat(trial.across, 2), len(ways)) if trial.across else None
-    return trajectories.passages(upright, ways, outcome.touched, outcome.clearance, across)
+    handedness = np.asarray(rooms.arena.handedness)
+    unmirror = np.stack([np.ones_like(handedness), handedness], axis=1)[:, None]
+    positions = np.asarray(record.position)[..., :2] * unmirror
+    unmirrored = [arena.mirror(room) if hand < 0 else room for room, hand in zip(arenas, handedness, strict=True)]
+    if not trial.ends_at_contact:
+        shown = unmirrored[:MAX_PANELS]
+        series = positions, np.asarray(record.resets), np.asarray(record.contact)
+        paths = [trajectories.Paths(*(leaf[[k]] for leaf in series)) for k in range(len(shown))]
+        return trajectories.plot_rooms(shown, paths)
+    outcome = trials.find_outcome(trial, record)
+    until_end = [path[:end] for path, end in zip(positions, outcome.frames, strict=True)]
+    offsets = np.resize(np.repeat(trial.lateral_offsets, 2), len(until_end)) if trial.lateral_offsets else None
+    return trajectories.plot_passages(unmirrored, until_end, outcome.touched, outcome.clearance, offsets)
 
 
-def _work(robot: closed_loop.Params, folder: Path, inputs: Mapping[str, Path], tried: Attempt, seed: int) -> None:
-    trial = trials.TRIALS[tried.trial]
-    rooms, record = walk(folder, tried, robot, seed)
-    storage.write_json(folder / "outcome.json", summary(trial, record))
-    (folder / "paths.png").write_bytes(style.to_png(draw(trial, rooms, record)))
-    _film(folder / "walk.mp4", robot.camera, rooms, record)
-
-
-def _film(target: Path, eyes: camera.Params, rooms: Room, record: Record) -> None:
-    """Film the robot that turned most."""
-    turning = np.abs(np.diff(record.velocity, axis=-1)).mean(axis=(1, 2))
-    liveliest = int(np.argmax(turning * np.asarray(record.ok)[:, -1]))
-    shown = walk_video.Walk(*(np.asarray(getattr(record, name))[liveliest] for name in walk_video.Walk._fields))
-    room = jax.tree.map(lambda leaf: leaf[liveliest], rooms.arena)
-    walk_video.write(target, shown, room, replace(eyes, overlap=1.0), FILM, eyes.overlap)
+def _write_results(folder: Path, trial_run: TrialRun, robot: closed_loop.Params, seed: int) -> None:
+    trial = trials.TRIALS[trial_run.trial]
+    rooms, record = record_trial(folder, trial_run, robot, seed)
+    storage.write_json(folder / "outcome.json", summarise(trial, record))
+    (folder / "paths.png").write_bytes(style.to_png(plot_trial(trial, rooms, record)))
+    walk_video.write_video(folder / "walk.mp4", record, rooms, robot, seconds=VIDEO_SECONDS)

@@ -1,22 +1,22 @@
-"""The paper's experiments as data: where robots start, how long they walk, and when they have got through.
+"""The paper's trials as data: rooms, start poses, duration, and the condition for having passed the obstacle.
 
-| trial    | paper             | what stands in the way                                      |
-| -------- | ----------------- | ----------------------------------------------------------- |
-| testing  | fig. 13           | sixteen obstacles, from (0, 2.5)                             |
-| unseen   | -                 | random rooms, one a robot                                    |
-| tube     | fig. 14           | a tube 1.25 m ahead, 0 to 0.42 m to either side              |
-| indoor   | figs. 15a, 16a    | a box ahead, one to the right, a table to the left           |
-| outdoor  | fig. 15b          | trees and bushes on grass, a facade behind                   |
-| dynamic  | figs. 15c, 16b, c | boxes put in the way from the left, then from the right      |
-| white    | sec. 5.4          | a wall without contrast ahead                                |
-| corner   | sec. 5.4          | a corner of two walls ahead                                  |
+| trial    | paper             | obstacles                                                      |
+| -------- | ----------------- | -------------------------------------------------------------- |
+| testing  | fig. 13           | sixteen, start at (0, 2.5)                                     |
+| unseen   | -                 | held-out random rooms, one per robot                           |
+| tube     | fig. 14           | a tube 1.25 m ahead, 0 to 0.42 m to either side                |
+| indoor   | figs. 15a, 16a    | a box ahead, one to the right, a table to the left             |
+| outdoor  | fig. 15b          | trees and bushes on grass, a facade behind them                |
+| dynamic  | figs. 15c, 16b, c | boxes that move in from the left, then from the right          |
+| white    | sec. 5.4          | a wall without contrast ahead                                  |
+| corner   | sec. 5.4          | a corner of two walls ahead                                    |
 
-In `testing` and `unseen` a robot that touches something is set back and walks on: collisions are counted per 100 m
-(`lgmdjax.evaluation.metrics`). The others ask whether it stayed untouched, up to the frame in which it had passed what
-stood in its way, or had walked for long enough; a robot that turns back walks about until then.
+In `testing` and `unseen` a robot that touches something is reset and walks on; the result is the number of collisions
+per 100 m (`lgmdjax.evaluation.metrics`). In the other trials the result is whether the robot touched anything. They end
+when it has touched something, has passed the obstacle, or the time is up; a robot that turns back walks on until then.
 
-A seed draws textures, by a key of its own that no training room has, and where exactly the robot is put down: within
-a centimetre, and two degrees. With half the seeds the room is mirrored.
+Each seed samples textures and the exact start pose, which is off by up to a centimetre and two degrees. The textures'
+random key is used by no training room. Every second seed mirrors the room.
 """
 
 from collections.abc import Callable
@@ -25,116 +25,120 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float, Int
+from numpy import ndarray
 
-from lgmdjax.evaluation.metrics import Estimate, wilson, yaws
+from lgmdjax import geometry
+from lgmdjax.evaluation.metrics import Estimate, wilson_proportion
+from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.simulation import room_batches
 from lgmdjax.simulation.closed_loop import Record, Room
 from lgmdjax.world import arena, scenes
 
-LATERALS = tuple(round(0.03 * k, 2) for k in range(15))  # d_y of fig. 14 [m]
-TUBE = 1.25  # d_x of fig. 14 [m]
-ROOMS = 2**22  # far from the numbers of a run's episodes: these rooms are met nowhere else
-LIBERTY = (0.01, 0.01, np.deg2rad(2.0))  # by how much a start may be off: x, y [m], yaw [rad]
-TURNED_BACK = 0.5 * np.pi  # rad from the first heading
+LATERAL_OFFSETS = tuple(round(0.03 * k, 2) for k in range(15))  # d_y of fig. 14 [m]
+TUBE_DISTANCE = 1.25  # d_x of fig. 14 [m]
+TRIAL_EPISODE = 2**22  # folded into the seed's key; far from the episode numbers of a run, whose rooms therefore differ
+START_JITTER = (0.01, 0.01, np.deg2rad(2.0))  # largest offset of a start pose: x, y [m], yaw [rad]
+TURN_BACK_ANGLE = 0.5 * np.pi  # rad from the first heading
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """One experiment; `rooms(key, seeds)` sets up its robots."""
+    """One trial; `make_rooms(key, seeds)` builds a room for each robot."""
 
-    name: str
+    name: TrialName
     title: str
     source: str  # figure or section of the paper
-    paper: str  # what it reports
-    shows: str
-    rooms: Callable[[Array, int], Room]
-    seeds: int  # as many as the paper has trials, or more
-    seconds: float  # of walking, at most
-    beyond: float = np.inf  # m, x of the place where the way is free again
-    across: tuple[float, ...] = ()  # m, distances beside the robot's way, each once to either side, seed after seed
-    ends: bool = True  # with the first touch; otherwise the robot is set back and walks on
+    paper: str  # the paper's result
+    shows: str  # caption of the figure
+    make_rooms: Callable[[Array, int], Room]
+    seeds: int  # number of repetitions: as many as in the paper, or more
+    seconds: float  # longest duration of a walk
+    beyond: float = np.inf  # m; a robot with a greater x has passed the obstacle
+    lateral_offsets: tuple[float, ...] = ()  # m, of the obstacle; every seed has each of them to the left and the right
+    ends_at_contact: bool = True  # otherwise the robot is reset and walks on
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of every robot of a trial, until its end."""
+    """Outcome of a trial for each robot."""
 
-    touched: np.ndarray  # something, or was lost
-    frames: np.ndarray  # until the end
-    clearance: np.ndarray  # m, the least
-    passed: np.ndarray  # untouched, and beyond what stood in its way
-    retreated: np.ndarray  # untouched, turned back, and not passed
+    touched: Bool[ndarray, " robots"]  # touched something, or was lost
+    frames: Int[ndarray, " robots"]  # until the robot's trial ended
+    clearance: Float[ndarray, " robots"]  # m, smallest until the end
+    passed: Bool[ndarray, " robots"]  # passed the obstacle without contact
+    retreated: Bool[ndarray, " robots"]  # turned back without contact, and did not pass
 
     def avoided(self) -> Estimate:
-        """Estimate the share of robots that stayed untouched, with Wilson's interval."""
-        return wilson(int((~self.touched).sum()), len(self.touched))
+        """Estimate the proportion of robots without contact, with Wilson's interval."""
+        return wilson_proportion(int((~self.touched).sum()), len(self.touched))
 
 
-def judge(trial: Trial, record: Record) -> Outcome:
-    """Find each robot's end of the trial, and what had happened by then; axes (robot, frame)."""
-    x, heading = np.asarray(record.position)[..., 0], np.unwrap(yaws(np.asarray(record.quaternion)), axis=1)
-    turned = np.abs(heading - heading[:, :1]) > TURNED_BACK
-    bad = np.asarray(record.contact) | ~np.asarray(record.ok)
-    beyond = x > trial.beyond
-    over = bad | beyond
-    over[:, -1] = True
-    end = over.argmax(axis=1)
+def find_outcome(trial: Trial, record: Record) -> Outcome:
+    """Find when each robot's trial ended and what happened until then; the record has axes (robot, frame)."""
+    x = np.asarray(record.position)[..., 0]
+    heading = np.unwrap(geometry.yaw(np.asarray(record.quaternion, dtype=float)), axis=1)
+    has_turned = np.abs(heading - heading[:, :1]) > TURN_BACK_ANGLE
+    has_failed = np.asarray(record.contact) | ~np.asarray(record.ok)
+    is_beyond = x > trial.beyond
+    is_over = has_failed | is_beyond
+    is_over[:, -1] = True
+    end = is_over.argmax(axis=1)
     at_end = (np.arange(len(end)), end)
-    until = np.arange(x.shape[1]) <= end[:, None]
-    touched, passed = bad[at_end], (beyond & ~bad)[at_end]
+    until_end = np.arange(x.shape[1]) <= end[:, None]
+    touched, passed = has_failed[at_end], (is_beyond & ~has_failed)[at_end]
     return Outcome(
         touched=touched,
         frames=end + 1,
-        clearance=np.where(until, record.clearance, np.inf).min(axis=1),
+        clearance=np.where(until_end, record.clearance, np.inf).min(axis=1),
         passed=passed,
-        retreated=(turned & until).any(axis=1) & ~touched & ~passed,
+        retreated=(has_turned & until_end).any(axis=1) & ~touched & ~passed,
     )
 
 
-def _alike(scene: Callable[[Array], arena.Arena]) -> Callable[[Array, int], Room]:
-    """Set up a scene once a seed, every second time mirrored."""
+def _repeat_scene(scene: Callable[[Array], arena.Arena]) -> Callable[[Array, int], Room]:
+    """Return a function that builds a scene once per seed, every second time mirrored."""
 
-    def rooms(key: Array, seeds: int) -> Room:
-        return room_batches.stack([_room(scene, jax.random.fold_in(key, n), bool(n % 2)) for n in range(seeds)])
+    def make_rooms(key: Array, seeds: int) -> Room:
+        return room_batches.stack_rooms([_room(scene, jax.random.fold_in(key, n), bool(n % 2)) for n in range(seeds)])
 
-    return rooms
+    return make_rooms
 
 
-def _tubes(key: Array, seeds: int) -> Room:
-    """Set up both sides of every lateral distance, `seeds` times."""
+def _tube_rooms(key: Array, seeds: int) -> Room:
+    """Build rooms with a tube at every lateral offset, to the left and to the right, `seeds` times."""
     rooms = [
         _room(lambda key, d_y=d_y: scenes.tube_scene(d_y, key), jax.random.fold_in(key, n), mirrored)
         for n in range(seeds)
-        for d_y in LATERALS
+        for d_y in LATERAL_OFFSETS
         for mirrored in (False, True)
     ]
-    return room_batches.stack(rooms)
+    return room_batches.stack_rooms(rooms)
 
 
 def _room(scene: Callable[[Array], arena.Arena], key: Array, mirrored: bool) -> Room:
-    """Build a scene for one robot, put down not quite at its start."""
-    texture_key, start_key, luck = jax.random.split(key, 3)
+    """Build a scene for one robot and add a random offset to its start pose."""
+    texture_key, start_key, policy_key = jax.random.split(key, 3)
     built = scene(texture_key)
-    # In float32, so that a key means the same start at any precision.
-    off = jax.random.uniform(start_key, (3,), jnp.float32, -1.0, 1.0).astype(float)
-    built = replace(built, start=built.start + off * jnp.asarray(LIBERTY))
+    # In float32, so that a key gives the same start at any precision.
+    offset = jax.random.uniform(start_key, (3,), jnp.float32, -1.0, 1.0).astype(float)
+    built = replace(built, start=built.start + offset * jnp.asarray(START_JITTER))
     built = arena.mirror(built) if mirrored else built
-    # As many starts as other rooms have, so that one program serves all.
-    return Room(arena=built, starts=jnp.tile(built.start, (room_batches.STARTS, 1)), key=luck)
+    # As many starts as other rooms have, so that one compiled program serves all.
+    return Room(arena=built, starts=jnp.tile(built.start, (room_batches.START_COUNT, 1)), key=policy_key)
 
 
-def _white(key: Array) -> arena.Arena:
+def _white_wall(key: Array) -> arena.Arena:
     white = jnp.asarray([235.0, 0.0, 0.0, 1.0], dtype=float)
-    room = scenes.textured(arena.empty_room((4.0, 4.0)), key)
+    room = scenes.with_random_textures(arena.empty_room((4.0, 4.0)), key)
     return replace(room, wall_texture=jnp.broadcast_to(white, (4, 4)))
 
 
 def _corner(key: Array) -> arena.Arena:
-    return scenes.textured(arena.empty_room((4.0, 4.0), start=(0.0, 0.0, 0.25 * jnp.pi)), key)
+    return scenes.with_random_textures(arena.empty_room((4.0, 4.0), start=(0.0, 0.0, 0.25 * jnp.pi)), key)
 
 
-TRIALS = {
+TRIALS: dict[str, Trial] = {
     trial.name: trial
     for trial in (
         Trial(
@@ -142,34 +146,34 @@ TRIALS = {
             title="the testing room",
             source="fig. 13",
             paper="235.3 m in five trials, no collision",
-            shows="Sixteen obstacles, from (0, 2.5).",
-            rooms=lambda key, seeds: room_batches.copies(key, scenes.testing_room(), seeds),
+            shows="Sixteen obstacles; the robots start at (0, 2.5).",
+            make_rooms=lambda key, seeds: room_batches.replicate_room(key, scenes.testing_room(), seeds),
             seeds=5,
             seconds=1080.0,
-            ends=False,
+            ends_at_contact=False,
         ),
         Trial(
             name="unseen",
-            title="random rooms never seen",
+            title="held-out random rooms",
             source="-",
             paper="not done",
-            shows="A random room a robot.",
-            rooms=room_batches.random_rooms,
+            shows="One random room per robot.",
+            make_rooms=room_batches.random_rooms,
             seeds=64,
             seconds=180.0,
-            ends=False,
+            ends_at_contact=False,
         ),
         Trial(
             name="tube",
             title="a single obstacle",
             source="fig. 14",
             paper="15 of 15",
-            shows="A tube 1.25 m ahead, up to 0.42 m to a side, before a white wall; below, how near the robot came.",
-            rooms=_tubes,
+            shows="A tube 1.25 m ahead, up to 0.42 m to a side, before a white wall; below, the smallest clearance.",
+            make_rooms=_tube_rooms,
             seeds=8,
             seconds=40.0,
-            beyond=TUBE + 0.4,
-            across=LATERALS,
+            beyond=TUBE_DISTANCE + 0.4,
+            lateral_offsets=LATERAL_OFFSETS,
         ),
         Trial(
             name="indoor",
@@ -177,7 +181,7 @@ TRIALS = {
             source="figs. 15a and 16a",
             paper="12 of 12",
             shows="A box 1.2 m ahead, another to the right, a table with thin legs to the left (its top dashed).",
-            rooms=_alike(scenes.indoor_scene),
+            make_rooms=_repeat_scene(scenes.indoor_scene),
             seeds=12,
             seconds=60.0,
             beyond=2.2,
@@ -188,18 +192,18 @@ TRIALS = {
             source="fig. 15b",
             paper="10 of 10",
             shows="Trees with crowns (dashed), bushes and hedges on grass, before a facade.",
-            rooms=_alike(scenes.outdoor_scene),
+            make_rooms=_repeat_scene(scenes.outdoor_scene),
             seeds=10,
             seconds=60.0,
             beyond=2.8,
         ),
         Trial(
             name="dynamic",
-            title="things put in the way",
+            title="moving obstacles",
             source="figs. 15c, 16b and 16c",
             paper="10 of 10, twice by walking backward",
-            shows="A box is put in the way from the left, then one from the right (dotted).",
-            rooms=_alike(scenes.dynamic_scene),
+            shows="A box moves into the way from the left, then one from the right (dotted).",
+            make_rooms=_repeat_scene(scenes.dynamic_scene),
             seeds=10,
             seconds=60.0,
             beyond=2.2,
@@ -209,8 +213,8 @@ TRIALS = {
             title="a white wall",
             source="sec. 5.4",
             paper="fails",
-            shows="Walls without contrast make no edges: a detector of edges cannot see them but for their rims.",
-            rooms=_alike(_white),
+            shows="A wall without contrast has no edges but its rims, so a detector of edges can't see it.",
+            make_rooms=_repeat_scene(_white_wall),
             seeds=12,
             seconds=60.0,
         ),
@@ -219,8 +223,8 @@ TRIALS = {
             title="a corner",
             source="sec. 5.4",
             paper="fails",
-            shows="Walking into the corner of two walls, the robot has as much before the one eye as before the other.",
-            rooms=_alike(_corner),
+            shows="The robot walks into the corner of two walls, and both eyes see the same.",
+            make_rooms=_repeat_scene(_corner),
             seeds=12,
             seconds=90.0,
         ),
@@ -228,6 +232,6 @@ TRIALS = {
 }
 
 
-def draw_rooms(name: str, seeds: int, seed: int) -> Room:
-    """Set up the rooms of a trial, a robot each: `seeds` times what the trial has."""
-    return TRIALS[name].rooms(jax.random.fold_in(jax.random.key(seed), ROOMS), seeds)
+def sample_rooms(name: str, seeds: int, seed: int) -> Room:
+    """Build the rooms of a trial, one per robot, for a number of seeds."""
+    return TRIALS[name].make_rooms(jax.random.fold_in(jax.random.key(seed), TRIAL_EPISODE), seeds)

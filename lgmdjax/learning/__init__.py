@@ -1,1 +1,5 @@
 """Fits: of the navigator, the detector, and of any controller parameter through the rollout."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

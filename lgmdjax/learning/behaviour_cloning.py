@@ -1,98 +1,108 @@
-"""Fits of the navigator to recorded walks: back-propagation through time over windows, the state carried on.
+"""Fit the navigator to recorded walks by truncated back-propagation through time.
 
-Stretches of walking lie end to end on a tape (`lgmdjax.learning.sequences`), cut into streams that are walked side by
-side, so that a network of 32 units fills a processor. A window of frames is one step of RMSprop; the state goes on
-into the next window, without its gradient, and starts anew where a stretch or a stream starts.
+The segments of the walks are concatenated and cut into parallel streams (`lgmdjax.learning.sequences`), so that a
+network of 32 units makes full use of a processor. Each window of frames is one step of RMSprop. The recurrent state
+is carried into the next window without its gradient, and is reset where a segment or a stream begins.
 
-| symbol | name          | unit              | equation                                    |
-| ------ | ------------- | ----------------- | ------------------------------------------- |
-| u      | walk.u        | 1                 | 17                                          |
-| v      | walk.label    | nominal, 0.05 m/s | 17, 22                                      |
-| -      | walk.velocity | nominal           | what the robot was told, whoever drove      |
-| MSE    | train, test   | nominal^2         | sec. 5.1; mean over frames and both sides   |
+| symbol | name                | unit              | equation                                  |
+| ------ | ------------------- | ----------------- | ----------------------------------------- |
+| u      | walk.u              | 1                 | 17                                        |
+| v      | walk.label          | nominal, 0.05 m/s | 17, 22                                    |
+| -      | walk.velocity       | nominal           | the command that the robot walked with    |
+| MSE    | train_mse, test_mse | nominal^2         | sec. 5.1; mean over frames and both sides |
 
 Source: Cizek & Faigl, sec. 3.4, 4.2 and 5.1: RMSprop, mean squared error, 1000 epochs, data split in half.
-Windows and streams are ours, and so is `mirrored`: the two hemifields are mirror images, so every walk is
-also a walk in the mirrored room, with left and right exchanged, and what is fitted is made `symmetric`. Fitted as it
-is, not as the mean of both, it has less to learn the walks by heart with: in rooms kept back its turns followed the
-labels with r = 0.68, in place of 0.61.
+
+Windows, streams and `mirrored` are our additions. The two hemifields are mirror images of each other, so every walk is
+also a walk in the mirrored room, with left and right exchanged. A network fitted to both is then made `symmetric`. It
+is fitted as it is, not as the mean of both views, since it then overfits less:
+
+| fitted as          | correlation of its turns with the labels, held-out rooms |
+| ------------------ | -------------------------------------------------------- |
+| one view           | 0.68                                                     |
+| mean of both views | 0.61                                                     |
 """
 
 import hashlib
 import math
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 from tqdm import tqdm
 
 from lgmdjax.control import navigator
 from lgmdjax.errors import InputError
-from lgmdjax.learning.checkpoints import Checkpoints
-from lgmdjax.learning.sequences import Tape, lay
+from lgmdjax.learning.checkpoints import Checkpoints, resumable
+from lgmdjax.learning.sequences import SequenceBatch, pack
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation.episodes import Walk
 
-CAUTION = 1.5
-"""By how much a driver should turn harder than its teacher. One network, 120 m in unseen rooms: 8.4 collisions per
-100 m at 1.0, 0.9 at 1.6, 2.6 at 2.5, and of the way that it made in the time at 1.0, 90 % and 63 % are left."""
+TURN_GAIN = 1.5
+"""How much harder a navigator turns than its teacher. For one network, over 120 m in held-out rooms:
 
-SAVE_EVERY = 10.0  # s between checkpoints, each of which takes as long as some epochs do
+| turn gain | collisions per 100 m | distance in the same time |
+| --------- | -------------------- | ------------------------- |
+| 1.0       | 8.4                  | 100 %                     |
+| 1.6       | 0.9                  | 90 %                      |
+| 2.5       | 2.6                  | 63 %                      |
+"""
+
+SAVE_EVERY = 10.0  # s between checkpoints; writing one takes as long as some epochs
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How to fit; the numbers that the paper gives are its own."""
+    """How to fit. Numbers that the paper gives are the paper's."""
 
     epochs: int = 1000
-    learning_rate: float = 1e-2  # of the first window; falls to nothing like half a cosine
+    learning_rate: float = 1e-2  # at the first window; decays to zero along half a cosine
     clip: float = 1.0  # largest norm of a gradient
-    window: int = 60  # frames through which the error goes back: 2 s, two steps of the gait
-    streams: int = 64  # walked side by side
-    mirrored: bool = True  # also with left and right exchanged
-    told: bool = False  # an efference copy is of walk.velocity, not of what the network itself said
+    window: int = 60  # frames of back-propagation through time: 2 s, two steps of the gait
+    streams: int = 64  # parallel sequences
+    mirrored: bool = True  # add the mirror image of every walk
+    command_feedback: bool = False  # the efference copy is walk.velocity, not the network's own last output
 
 
 @struct.dataclass(kw_only=True)
 class Progress:
-    """Where a fit is; everything that it needs to go on."""
+    """The state of a fit between two epochs; checkpoints have these names on disk."""
 
-    weights: Any
-    optimiser: Any
-    best: Any  # weights with the least test error so far
+    weights: PyTree
+    optimiser: optax.OptState
+    best: PyTree  # weights with the lowest test error so far
     epoch: Int[Array, ""]
-    train: Float[Array, "epochs"]  # MSE while the epoch was walked
-    test: Float[Array, "epochs"]  # MSE after it
+    train: Float[Array, "epochs"]  # MSE of the training data during each epoch, nan for those to come
+    test: Float[Array, "epochs"]  # MSE of the test data after each epoch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit:
-    """What came of a fit: the last network, the best one on the test half, and the two curves of fig. 11."""
+class FitResult:
+    """The navigator after the last epoch, the best one on the test data, and the two curves of fig. 11."""
 
     params: navigator.Params
     best: navigator.Params
-    train: Float[np.ndarray, "epochs"]
-    test: Float[np.ndarray, "epochs"]
+    train_mse: Float[np.ndarray, "epochs"]
+    test_mse: Float[np.ndarray, "epochs"]
 
 
 def standardise(params: navigator.Params, walks: Sequence[Walk], mirrored: bool = True) -> navigator.Params:
-    """Set the constants to mean and deviation of u and of the labels, both sides alike if mirrored."""
+    """Set input and output scaling to mean and deviation of u and of the labels, equal for both sides if mirrored."""
     u, label = (np.concatenate([getattr(walk, name) for walk in walks]) for name in ("u", "label"))
     u, label = (np.concatenate([x, x[:, ::-1]]) if mirrored else x for x in (u, label))
     as_array = partial(jnp.asarray, dtype=float)
     return replace(
         params,
         input_mean=as_array(u.mean(0)),
-        input_scale=as_array(np.maximum(u.std(0), 1e-3)),  # a blind eye must not become a loud one
+        input_scale=as_array(np.maximum(u.std(0), 1e-3)),  # a constant u must not be amplified
         output_mean=as_array(label.mean(0)),
         output_scale=as_array(np.maximum(label.std(0), 1e-3)),
     )
@@ -105,88 +115,63 @@ def fit(
     settings: Settings | None = None,
     *,
     checkpoints: Path | str | None = None,
-    show: bool = True,
-) -> Fit:
-    """Fit the weights to the labels of `train`, and watch the error on `test`.
+    show_progress: bool = True,
+) -> FitResult:
+    """Fit the weights to the labels of `train`; measure the error on `test` after every epoch.
 
     Args:
-        params: an untrained navigator; its constants are set from `train`.
-        train: stretches of walking to learn from.
-        test: stretches for the second curve, and to choose `best` by.
-        settings: see there. `told` suits walks that the network drove itself; from the teacher's it learns to
-            repeat the last label, which is nearly the next, and knows nothing when it drives.
-        checkpoints: folder to save progress in, and to carry on from: the result is the same, bit for bit.
-        show: show a progress bar.
+        params: an untrained navigator; its scaling is set from `train`.
+        train: segments to fit to.
+        test: segments for the second curve and for the choice of `best`.
+        settings: the defaults if None. `command_feedback` suits walks that the network itself controlled. On the
+            teacher's walks a network with it only learns to repeat the last label, which is nearly the next one.
+        checkpoints: folder to save progress in and to resume from; the result is the same, bit for bit.
+        show_progress: show a progress bar.
     """
-    settings = _checked(settings or Settings(), train, test)
+    settings = _require_sound(settings or Settings(), train, test)
     params = replace(standardise(params, train, settings.mirrored), symmetric=False)
-    tapes = _tape(params, train, settings), _tape(params, test, settings)
-    progress = _start(params, settings)
+    data = _pack(params, train, settings), _pack(params, test, settings)
+    initial = _initial_progress(params, settings)
     if checkpoints is None:
-        progress = _finish(params, progress, tapes, settings, None, show)
+        progress = _run_epochs(params, initial, data, settings, checkpoints=None, show_progress=show_progress)
     else:
-        with closing(Checkpoints(checkpoints, _identity(progress, tapes, settings))) as saved:
-            progress = _finish(params, saved.latest(progress), tapes, settings, saved, show)
+        with closing(Checkpoints(checkpoints, _identity(initial, data, settings))) as saved:
+            progress = _run_epochs(params, initial, data, settings, checkpoints=saved, show_progress=show_progress)
     fitted = replace(params, symmetric=settings.mirrored)
-    return Fit(
+    return FitResult(
         params=replace(fitted, weights=progress.weights),
         best=replace(fitted, weights=progress.best),
-        train=np.asarray(progress.train),
-        test=np.asarray(progress.test),
+        train_mse=np.asarray(progress.train),
+        test_mse=np.asarray(progress.test),
     )
 
 
-def _finish(
-    params: navigator.Params,
-    progress: Progress,
-    tapes: tuple[Tape, Tape],
-    settings: Settings,
-    saved: Checkpoints | None,
-    show: bool,
-) -> Progress:
-    """Run the epochs that are left, some hundredth of all at a time."""
-    total, done = settings.epochs, int(progress.epoch)
-    chunk = max(1, total // 100)
-    last_saved = time.monotonic()
-    with tqdm(total=total, initial=done, desc=params.variant, unit="epoch", disable=not show) as bar:
-        while done < total:
-            epochs = min(chunk, total - done)
-            progress = jax.block_until_ready(_advance(params, progress, *tapes, epochs, settings))
-            done += epochs
-            if saved is not None and (done == total or time.monotonic() - last_saved >= SAVE_EVERY):
-                saved.save(done, progress)
-                last_saved = time.monotonic()
-            bar.set_postfix(mse=f"{progress.train[done - 1]:.4f}", test=f"{progress.test[done - 1]:.4f}")
-            bar.update(epochs)
-    return progress
-
-
 def predict(params: navigator.Params, walks: Sequence[Walk]) -> list[Float[np.ndarray, "frames 2"]]:
-    """Let the navigator answer to the u of each stretch from a fresh start, hearing its own last velocity."""
+    """Return the navigator's velocities for the u of each segment, from a reset state, with its own feedback."""
     frames = max(len(walk) for walk in walks)
     u = np.stack([np.pad(walk.u, ((0, frames - len(walk)), (0, 0)), mode="edge") for walk in walks])
-    velocities = np.asarray(_respond(params, jnp.asarray(u, dtype=float)))
+    velocities = np.asarray(_predict_batch(params, jnp.asarray(u, dtype=float)))
     return [velocity[: len(walk)] for walk, velocity in zip(walks, velocities, strict=True)]
 
 
-def enliven(
-    params: navigator.Params, walks: Sequence[Walk], caution: float = CAUTION, most: float = 2.5
+def rescale_turns(
+    params: navigator.Params, walks: Sequence[Walk], turn_gain: float = TURN_GAIN, max_scale: float = 2.5
 ) -> navigator.Params:
-    """Scale the outputs about their mean until the navigator's turns vary `caution` times as much as the labels do.
+    """Scale the outputs about their mean so that the navigator's turns vary `turn_gain` times as much as the labels'.
 
-    The least mean squared error is that of a timid driver: the less sure the network is, the nearer it stays to
-    the mean, and a robot that turns half as hard as it should, when it should, walks into what it has seen. Nor do
-    errors cost the same: a turn too many costs a little time, a turn too few a collision. The scale is
-    `output_scale`, times std(turn of the labels) / std(turn predicted) from 1 up to `most`, times `caution`.
+    A network with the lowest mean squared error turns too little: where it is uncertain it stays near the mean, and a
+    robot that turns half as hard as it should collides. Errors also differ in cost: an unnecessary turn costs a little
+    time, a missing one a collision. `output_scale` is multiplied by `turn_gain` times the ratio std(turns of the
+    labels) / std(turns predicted), which is clipped to 1..`max_scale`.
     """
     predicted, label = np.concatenate(predict(params, walks)), np.concatenate([walk.label for walk in walks])
-    asked, given = (float(np.std(v[:, 1] - v[:, 0])) for v in (label, predicted))
-    factor = caution * float(np.clip(asked / max(given, 1e-6), 1.0, most))
+    wanted, actual = (float(np.std(v[:, 1] - v[:, 0])) for v in (label, predicted))
+    factor = turn_gain * float(np.clip(wanted / max(actual, 1e-6), 1.0, max_scale))
     return replace(params, output_scale=params.output_scale * factor)
 
 
-def score(params: navigator.Params, walks: Sequence[Walk]) -> dict[str, Any]:
-    """Compare predictions with labels: MSE, R2 of either side, correlation of the turns v_right - v_left."""
+def score(params: navigator.Params, walks: Sequence[Walk]) -> JsonObject:
+    """Compare predictions with labels: MSE, R2 of each side, correlation of the turns v_right - v_left."""
     predicted = np.concatenate(predict(params, walks)).astype(float)
     label = np.concatenate([walk.label for walk in walks]).astype(float)
     error = np.mean((predicted - label) ** 2, axis=0)
@@ -199,96 +184,123 @@ def score(params: navigator.Params, walks: Sequence[Walk]) -> dict[str, Any]:
     }
 
 
-def table(fitted: Mapping[str, navigator.Params], walks: Mapping[str, Sequence[Walk]]) -> list[dict[str, Any]]:
-    """Score every navigator on every set of walks: a row each, columns like `test_mse`, `unseen_r2`."""
+def score_variants(navigators: Mapping[str, navigator.Params], walks: Mapping[str, Sequence[Walk]]) -> list[JsonObject]:
+    """Score every navigator on every set of walks: one row each, with columns such as `test_mse`, `unseen_r2`."""
     rows = []
-    for variant, params in fitted.items():
+    for variant, params in navigators.items():
         scores = {name: score(params, some) for name, some in walks.items()}
         columns = {f"{name}_{key}": value for name, s in scores.items() for key, value in s.items()}
         rows.append({"variant": variant, **columns})
     return rows
 
 
+def window_loss(
+    params: navigator.Params, weights: PyTree, states: navigator.State, batch: SequenceBatch, *, command_feedback: bool
+) -> tuple[Array, tuple[Array, navigator.State]]:
+    """Run the network over one window; return its MSE, and (sum of squared errors, states after the window)."""
+    params = replace(params, weights=weights)
+    initial = _init_states(params, batch)
+
+    def frame(states: navigator.State, now: SequenceBatch) -> tuple[navigator.State, Array]:
+        if command_feedback:
+            states = replace(states, velocity=now.previous_velocity)
+        reset = jax.vmap(lambda is_first, *both: jax.tree.map(partial(jnp.where, is_first), *both))
+        states = reset(now.is_first, initial, states)
+        states, velocity = jax.vmap(navigator.step, in_axes=(None, 0, 0))(params, states, now.u)
+        return states, jnp.sum(now.mask[:, None] * (velocity - now.label) ** 2)
+
+    states, squares = jax.lax.scan(frame, states, batch)
+    total = jnp.sum(squares)
+    return total / (2 * jnp.maximum(jnp.sum(batch.mask), 1.0)), (total, states)
+
+
+def _run_epochs(
+    params: navigator.Params,
+    initial: Progress,
+    data: tuple[SequenceBatch, SequenceBatch],
+    settings: Settings,
+    *,
+    checkpoints: Checkpoints | None,
+    show_progress: bool,
+) -> Progress:
+    """Run the remaining epochs, a hundredth of all epochs in one call, with a progress bar."""
+
+    def advance(progress: Progress, epoch: int, end: int) -> Progress:
+        return _train_epochs(params, progress, data, end - epoch, settings)
+
+    total = settings.epochs
+    steps = resumable(advance, initial, checkpoints, total=total, chunk=max(1, total // 100), interval=SAVE_EVERY)
+    done, progress = next(steps)
+    with tqdm(total=total, initial=done, desc=params.variant, unit="epoch", disable=not show_progress) as bar:
+        for epoch, progress in steps:
+            bar.set_postfix(mse=f"{progress.train[epoch - 1]:.4f}", test=f"{progress.test[epoch - 1]:.4f}")
+            bar.update(epoch - done)
+            done = epoch
+    return progress
+
+
 @partial(jax.jit, static_argnames="settings")
-def _advance(
+def _train_epochs(
     params: navigator.Params,
     progress: Progress,
-    train: Tape,
-    test: Tape,
+    data: tuple[SequenceBatch, SequenceBatch],
     epochs: Int[Array, ""] | int,
     settings: Settings,
 ) -> Progress:
-    """Walk the tapes some epochs on; a number of epochs that is no constant of the program."""
-    return jax.lax.fori_loop(0, epochs, lambda _, p: _epoch(params, p, train, test, settings), progress)
+    """Train for some epochs; their number is traced, so that one program serves all calls."""
+    return jax.lax.fori_loop(0, epochs, lambda _, p: _train_epoch(params, p, *data, settings), progress)
 
 
-def _epoch(params: navigator.Params, progress: Progress, train: Tape, test: Tape, settings: Settings) -> Progress:
+def _train_epoch(
+    params: navigator.Params, progress: Progress, train: SequenceBatch, test: SequenceBatch, settings: Settings
+) -> Progress:
     optimiser = _optimiser(settings, len(train.u))
+    loss = partial(window_loss, params, command_feedback=settings.command_feedback)
 
-    def window(carry: tuple[Any, Any, navigator.State], tape: Tape):
+    def window(carry: tuple[PyTree, optax.OptState, navigator.State], batch: SequenceBatch):
         weights, memory, states = carry
-        loss = jax.value_and_grad(partial(window_error, params, told=settings.told), has_aux=True)
-        (_, (squares, states)), gradient = loss(weights, states, tape)
+        (_, (squares, states)), gradient = jax.value_and_grad(loss, has_aux=True)(weights, states, batch)
         updates, memory = optimiser.update(gradient, memory)
         return (optax.apply_updates(weights, updates), memory, states), squares
 
-    carry = progress.weights, progress.optimiser, _states(params, train)
+    carry = progress.weights, progress.optimiser, _init_states(params, train)
     (weights, memory, _), squares = jax.lax.scan(window, carry, train)
-    error = _tape_error(replace(params, weights=weights), test)
-    better = ~(error >= jnp.nanmin(progress.test))  # the first epoch too, when there is nothing but nan
+    error = _batch_mse(replace(params, weights=weights), test)
+    better = ~(error >= jnp.nanmin(progress.test))  # true for the first epoch too, when all are nan
     return Progress(
         weights=weights,
         optimiser=memory,
         best=jax.tree.map(lambda new, old: jnp.where(better, new, old), weights, progress.best),
         epoch=progress.epoch + 1,
-        train=progress.train.at[progress.epoch].set(jnp.sum(squares) / (2 * jnp.sum(train.counts))),
+        train=progress.train.at[progress.epoch].set(jnp.sum(squares) / (2 * jnp.sum(train.mask))),
         test=progress.test.at[progress.epoch].set(error),
     )
 
 
-def window_error(
-    params: navigator.Params, weights: Any, states: navigator.State, tape: Tape, *, told: bool
-) -> tuple[Array, tuple[Array, navigator.State]]:
-    """Walk one window; return its MSE, and its sum of squares and the states at its end."""
-    params = replace(params, weights=weights)
-    start = _states(params, tape)
+def _batch_mse(params: navigator.Params, batch: SequenceBatch) -> Float[Array, ""]:
+    """Return the MSE over all windows of a batch."""
 
-    def frame(states: navigator.State, now: Tape) -> tuple[navigator.State, Array]:
-        if told:
-            states = replace(states, velocity=now.last)
-        states = jax.vmap(lambda fresh, *both: jax.tree.map(partial(jnp.where, fresh), *both))(now.fresh, start, states)
-        states, velocity = jax.vmap(navigator.step, in_axes=(None, 0, 0))(params, states, now.u)
-        return states, jnp.sum(now.counts[:, None] * (velocity - now.label) ** 2)
-
-    states, squares = jax.lax.scan(frame, states, tape)
-    total = jnp.sum(squares)
-    return total / (2 * jnp.maximum(jnp.sum(tape.counts), 1.0)), (total, states)
-
-
-def _tape_error(params: navigator.Params, tape: Tape) -> Float[Array, ""]:
-    """Walk a tape without learning, and return its MSE."""
-
-    def window(states: navigator.State, tape: Tape) -> tuple[navigator.State, Array]:
-        _, (squares, states) = window_error(params, params.weights, states, tape, told=False)
+    def window(states: navigator.State, batch: SequenceBatch) -> tuple[navigator.State, Array]:
+        _, (squares, states) = window_loss(params, params.weights, states, batch, command_feedback=False)
         return states, squares
 
-    _, squares = jax.lax.scan(window, _states(params, tape), tape)
-    return jnp.sum(squares) / (2 * jnp.sum(tape.counts))
+    _, squares = jax.lax.scan(window, _init_states(params, batch), batch)
+    return jnp.sum(squares) / (2 * jnp.sum(batch.mask))
 
 
 @jax.jit
-def _respond(params: navigator.Params, u: Float[Array, "walks frames 2"]) -> Float[Array, "walks frames 2"]:
+def _predict_batch(params: navigator.Params, u: Float[Array, "walks frames 2"]) -> Float[Array, "walks frames 2"]:
     walk = lambda u: jax.lax.scan(partial(navigator.step, params), navigator.init(params), u)[1]  # noqa: E731
     return jax.vmap(walk)(u)
 
 
 def _optimiser(settings: Settings, windows: int) -> optax.GradientTransformation:
-    """RMSprop as Keras has it, but for a rate that falls; its own 1e-3 throughout is a fifth worse after 60 epochs."""
+    """Return Keras's RMSprop with a decaying rate; a constant 1e-3 gives a fifth more error after 60 epochs."""
     rate = optax.cosine_decay_schedule(settings.learning_rate, settings.epochs * windows)
     return optax.chain(optax.clip_by_global_norm(settings.clip), optax.rmsprop(rate, decay=0.9, eps=1e-7))
 
 
-def _start(params: navigator.Params, settings: Settings) -> Progress:
+def _initial_progress(params: navigator.Params, settings: Settings) -> Progress:
     unknown = jnp.full(settings.epochs, jnp.nan)
     return Progress(
         weights=params.weights,
@@ -300,18 +312,18 @@ def _start(params: navigator.Params, settings: Settings) -> Progress:
     )
 
 
-def _states(params: navigator.Params, tape: Tape) -> navigator.State:
-    """One fresh state a stream."""
-    return jax.vmap(lambda _: navigator.init(params))(jnp.arange(tape.fresh.shape[-1]))
+def _init_states(params: navigator.Params, batch: SequenceBatch) -> navigator.State:
+    """Return one initial state per stream."""
+    return jax.vmap(lambda _: navigator.init(params))(jnp.arange(batch.is_first.shape[-1]))
 
 
-def _tape(params: navigator.Params, walks: Sequence[Walk], settings: Settings) -> Tape:
-    first = np.asarray(params.output_mean)
-    return lay(walks, first, streams=settings.streams, window=settings.window, mirrored=settings.mirrored)
+def _pack(params: navigator.Params, walks: Sequence[Walk], settings: Settings) -> SequenceBatch:
+    mean = np.asarray(params.output_mean)
+    return pack(walks, mean, streams=settings.streams, window=settings.window, mirrored=settings.mirrored)
 
 
-def _checked(settings: Settings, train: Sequence[Walk], test: Sequence[Walk]) -> Settings:
-    """Raise `InputError` for settings without sense, and for data that are missing or not finite."""
+def _require_sound(settings: Settings, train: Sequence[Walk], test: Sequence[Walk]) -> Settings:
+    """Return the settings; raise `InputError` for settings out of range and for data missing or not finite."""
     for name in ("epochs", "window", "streams"):
         if getattr(settings, name) < 1:
             raise InputError(f"training {name}: expected 1 or more, got {getattr(settings, name)}")
@@ -321,16 +333,18 @@ def _checked(settings: Settings, train: Sequence[Walk], test: Sequence[Walk]) ->
         if sum(len(walk) for walk in walks) < 2:
             raise InputError(f"training: expected frames to {name} on, got none; collect longer walks")
         if not all(np.isfinite(x).all() for walk in walks for x in (walk.u, walk.label, walk.velocity)):
-            raise InputError(f"training: expected finite u and v to {name} on, got some that are not")
+            raise InputError(f"training: expected finite u and v to {name} on, got nan or infinity; collect them again")
     return settings
 
 
-def _identity(start: Progress, tapes: tuple[Tape, Tape], settings: Settings) -> dict[str, Any]:
-    """Tell this fit from any other: its settings, and what it starts from."""
+def _identity(initial: Progress, data: tuple[SequenceBatch, SequenceBatch], settings: Settings) -> JsonObject:
+    """Return what distinguishes this fit from any other: its settings, data and initial weights."""
 
-    def digest(tree: Any) -> str:
+    def digest(tree: PyTree) -> str:
         leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
         return hashlib.sha256(b"".join(leaves)).hexdigest()
 
-    data = {"training data": digest(tapes[0]), "test data": digest(tapes[1])}
-    return asdict(settings) | data | {"first weights": digest(start.weights)}
+    names = asdict(settings)
+    names["told"] = names.pop("command_feedback")  # its name on disk
+    hashes = {"training data": digest(data[0]), "test data": digest(data[1]), "first weights": digest(initial.weights)}
+    return names | hashes

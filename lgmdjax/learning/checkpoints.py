@@ -1,82 +1,90 @@
-"""Progress of a fit on disk (orbax), to carry on from after an interruption: the same result, bit for bit.
+"""Progress of a fit on disk (orbax). An interrupted fit resumes and gives the same result, bit for bit.
 
-A checkpoint knows what it belongs to, a fingerprint of data, settings and first weights, and is refused by
-any other fit. Only the newest is kept; one that was not finished is not seen.
+Each checkpoint stores the identity of its fit, a fingerprint of data, settings and initial weights. A fit with
+another identity refuses the checkpoint. Only the newest checkpoint is kept; one that was interrupted while it was
+written is ignored.
 """
 
 import json
 import logging
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jaxtyping import PyTree
 
 from lgmdjax.errors import InputError
+from lgmdjax.runtime.storage import JsonObject
 
 Progress = TypeVar("Progress")
 
 
 class Checkpoints:
-    """A folder of checkpoints of one fit.
+    """A folder with the checkpoints of one fit.
 
     Args:
-        folder: made if it is not there.
-        belongs: JSON values that tell this fit from others.
+        folder: created if it does not exist.
+        identity: JSON values that distinguish this fit from any other.
     """
 
-    def __init__(self, folder: Path | str, belongs: dict[str, Any]):
-        logging.getLogger("absl").setLevel(logging.ERROR)  # orbax tells of every file
-        self.folder, self.belongs = Path(folder).absolute(), json.loads(json.dumps(belongs))
+    def __init__(self, folder: Path | str, identity: JsonObject):
+        logging.getLogger("absl").setLevel(logging.ERROR)  # orbax logs a line for every file
+        self.folder, self.identity = Path(folder).absolute(), json.loads(json.dumps(identity))
         options = ocp.CheckpointManagerOptions(max_to_keep=1, create=True, enable_async_checkpointing=False)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.manager = ocp.CheckpointManager(self.folder, options=options)
         except (OSError, ValueError) as error:
             raise InputError(
-                f"{folder}: expected a folder for checkpoints, got {_line(error)}; choose another"
+                f"{folder}: expected a folder for checkpoints, got {_first_line(error)}; choose another"
             ) from error
 
-    def latest(self, start: Progress) -> Progress:
-        """Read the newest progress, or return `start` if there is none; it also gives shapes and dtypes."""
+    def restore_latest(self, initial: Progress) -> tuple[int, Progress]:
+        """Return the newest checkpoint as (step, progress), or (0, `initial`) if there is none.
+
+        `initial` also gives structure, shapes and dtypes of what is read.
+        """
         step = self.manager.latest_step()
         if step is None:
-            return start
-        template = jax.tree.map(ocp.utils.to_shape_dtype_struct, start)
+            return 0, initial
+        template = jax.tree.map(ocp.utils.to_shape_dtype_struct, initial)
         try:
-            tag = ocp.args.Composite(belongs=ocp.args.JsonRestore())  # pyright: ignore
-            self._require_own(self.manager.restore(step, args=tag)["belongs"])
-            wanted = ocp.args.Composite(progress=ocp.args.StandardRestore(template))  # pyright: ignore
-            restored = self.manager.restore(step, args=wanted)["progress"]
+            identity = ocp.args.Composite(belongs=ocp.args.JsonRestore())  # pyright: ignore
+            self._require_same_identity(self.manager.restore(step, args=identity)["belongs"])
+            contents = ocp.args.Composite(progress=ocp.args.StandardRestore(template))  # pyright: ignore
+            restored = self.manager.restore(step, args=contents)["progress"]
         except InputError:
             raise
         except Exception as error:  # orbax raises whatever its storage layer does
             raise InputError(
-                f"{self.folder}: expected a whole checkpoint, got {_line(error)}; remove it to start again"
+                f"{self.folder}: expected a whole checkpoint, got {_first_line(error)}; remove it to start again"
             ) from error
-        # Orbax ties them to a device, and what is tied to one cannot meet a crowd that is dealt out to several.
-        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), restored)
+        # Orbax commits arrays to one device; JAX refuses to combine those with arrays sharded over several.
+        return step, jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), restored)
 
-    def save(self, step: int, progress: Any) -> None:
+    def save(self, step: int, progress: PyTree) -> None:
         """Write progress; it is complete on disk when this returns."""
         args = ocp.args.Composite(
             progress=ocp.args.StandardSave(progress),  # pyright: ignore
-            belongs=ocp.args.JsonSave(self.belongs),  # pyright: ignore
+            belongs=ocp.args.JsonSave(self.identity),  # pyright: ignore  (the identity's name on disk)
         )
         try:
             self.manager.save(step, args=args)
             self.manager.wait_until_finished()
         except OSError as error:
-            raise InputError(f"{self.folder}: expected to write, got {_line(error)}; free some disk") from error
+            raise InputError(f"{self.folder}: expected to write, got {_first_line(error)}; free some disk") from error
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Close the folder."""
         self.manager.close()
 
-    def _require_own(self, belongs: dict[str, Any]) -> None:
-        names = sorted(name for name in self.belongs if belongs.get(name) != self.belongs[name])
+    def _require_same_identity(self, found: JsonObject) -> None:
+        names = sorted(name for name in self.identity if found.get(name) != self.identity[name])
         if names:
             raise InputError(
                 f"{self.folder}: expected checkpoints of the same fit, got another {', '.join(names)}; "
@@ -84,5 +92,40 @@ class Checkpoints:
             )
 
 
-def _line(error: Exception) -> str:
+def resumable(
+    advance: Callable[[Progress, int, int], Progress],
+    initial: Progress,
+    checkpoints: Checkpoints | None,
+    *,
+    total: int,
+    chunk: int = 1,
+    interval: float = 0.0,
+) -> Iterator[tuple[int, Progress]]:
+    """Advance progress from its newest checkpoint to step `total`; yield (step, progress) first and after each chunk.
+
+    Args:
+        advance: `advance(progress, step, end)` returns the progress at step `end`.
+        initial: progress at step 0.
+        checkpoints: where progress is saved and resumed from; None saves nothing.
+        total: number of steps.
+        chunk: steps in one call of `advance`.
+        interval: least time between two checkpoints [s]; the last step is always saved.
+
+    >>> list(resumable(lambda progress, step, end: progress + (end - step), 0, None, total=5, chunk=2))
+    [(0, 0), (2, 2), (4, 4), (5, 5)]
+    """
+    step, progress = (0, initial) if checkpoints is None else checkpoints.restore_latest(initial)
+    last_saved = time.monotonic()
+    yield step, progress
+    while step < total:
+        end = min(step + chunk, total)
+        progress = jax.block_until_ready(advance(progress, step, end))
+        step = end
+        if checkpoints is not None and (step == total or time.monotonic() - last_saved >= interval):
+            checkpoints.save(step, progress)
+            last_saved = time.monotonic()
+        yield step, progress
+
+
+def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {error}".split("\n")[0][:200]

@@ -1,11 +1,11 @@
-"""Practice: let the navigator walk, label its walks with the rule, and fit it to all walks so far; some rounds of it.
+"""DAgger: roll out the navigator, label its walks with the teacher's rule, fit it to all walks so far, and repeat.
 
-Imitation of recorded walks alone leaves a robot that does not turn: while the teacher turns, the turn itself floods
-both eyes, so that "much moves" foretells "turn" in the recorded walks, and a robot that has not begun to turn never
-sees it. The rule is free in simulation, so the navigator's own walks are labelled with it and learned from as well.
+A robot that only imitates recorded walks does not turn. While the teacher turns, its own turn excites both LGMDs, so
+in the recorded walks strong excitation predicts a turn; a robot that is not yet turning never sees that excitation.
+The rule costs nothing in simulation, so the navigator's own walks are labelled with it and added to the training data.
 
-How much harder than its teacher the navigator should turn in the end (`training.enliven`) is tried out: collisions are
-too rare to choose by, but how often it comes nearer to something than `TIGHT` tells careless drivers from careful ones.
+How much harder than its teacher the final navigator turns (`behaviour_cloning.rescale_turns`) is chosen by walking
+with several gains. Collisions are too rare to compare them by; approaches nearer than `APPROACH_CLEARANCE` are not.
 
 Source: Ross, Gordon & Bagnell 2011 (DAgger).
 """
@@ -13,140 +13,174 @@ Source: Ross, Gordon & Bagnell 2011 (DAgger).
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
-from lgmdjax.control import navigator, policies
+from lgmdjax.control import names, navigator, policies
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import metrics
 from lgmdjax.learning import behaviour_cloning, sequences
 from lgmdjax.learning.settings import TrainSettings
 from lgmdjax.locomotion import cpg
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, room_batches
 from lgmdjax.simulation.episodes import Walk
 
-OWN_WALKS = 2**19  # number of the first episode that the navigator walks itself: rooms of their own
-TRYOUT = 2**20  # number of the episode whose rooms caution is chosen in
-TIGHT = 0.08  # m of clearance
-KEPT_BACK = 0.25  # share of the rooms that no learner is shown; half of them choose its best epoch, half judge it
+FIRST_LEARNER_EPISODE = 2**19  # number of the first DAgger round's episode; its rooms are in no other episode
+TURN_GAIN_EPISODE = 2**20  # number of the episode in whose rooms turn gains are compared
+APPROACH_CLEARANCE = 0.08  # m
+HELD_OUT_FRACTION = 0.25  # of the rooms; one half chooses a fit's best epoch, the other scores the fit
 
 
-def lesson(
-    folder: Path, robot: closed_loop.Params, robots: int, seconds: float, seed: int, facts: Mapping[str, Any]
+def record_demonstrations(
+    folder: Path,
+    robot: closed_loop.Params,
+    *,
+    robots: int,
+    seconds: float,
+    seed: int,
+    parameters: Mapping[str, object],
 ) -> list[Walk]:
-    """Let a robot's teacher walk in rooms to learn in, with its eyes open."""
-    how = {"seed": seed, "facts": {**facts, "robot": assembly.digest(robot)}, "label": "lesson", "draw": True}
-    recording.walked(folder, robot, room_batches.rooms_of(seed, 0, robots), seconds, policies.TEACHER, **how)
+    """Record the teacher's walks in training rooms, with camera and LGMD, and return them.
+
+    Args:
+        folder: for the walks; walks that it already holds are not repeated.
+        robot: the robot whose teacher walks.
+        robots: number of robots. seconds: simulated time of each.
+        seed: of the rooms.
+        parameters: JSON values that distinguish these walks from others.
+    """
+    recording.record_rollouts(
+        folder,
+        robot,
+        room_batches.training_rooms(seed, 0, robots),
+        seconds,
+        policies.TEACHER,
+        seed=seed,
+        parameters={**parameters, "robot": assembly.fingerprint(robot)},
+        label="demonstrations",
+        render=True,
+    )
     return episodes.read(folder)
 
 
-def learn(
-    folder: Path, walks: Sequence[Walk], epochs: int, seed: int, variant: navigator.Variant = "lstm"
+def fit_navigator(
+    folder: Path, walks: Sequence[Walk], epochs: int, seed: int, variant: names.Variant = "lstm"
 ) -> tuple[navigator.Params, list[Walk]]:
-    """Fit a new navigator to walks; give the best one, and the stretches that it was chosen by."""
-    train, test, _ = split(episodes.stretches(walks), seed)
-    start, settings = navigator.create(jax.random.key(seed), variant), behaviour_cloning.Settings(epochs=epochs)
-    return behaviour_cloning.fit(start, train, test, settings, checkpoints=folder).best, test
+    """Fit a new navigator to walks; return the best one, and the segments that it was chosen by."""
+    train, test, _ = split_rooms(episodes.segments(walks), seed)
+    untrained, settings = navigator.create(jax.random.key(seed), variant), behaviour_cloning.Settings(epochs=epochs)
+    return behaviour_cloning.fit(untrained, train, test, settings, checkpoints=folder).best, test
 
 
-def practise(
+def run(
     folder: Path,
     robot: closed_loop.Params,
     walks: list[Walk],
     settings: TrainSettings,
     seed: int,
-    variant: navigator.Variant = "lstm",
+    *,
+    variant: names.Variant = "lstm",
 ) -> list[Walk]:
-    """Fit and walk in turns; give the walks that were there and those that came.
+    """Alternate fits and rollouts; return the given walks and those of all rounds.
 
     Args:
-        folder: for fits and walks, from which an interrupted practice carries on.
-        robot: who practises; its teacher labels.
-        walks: recorded before. variant: of the navigator.
-        settings: how many rounds, how long. seed: of rooms, weights and the split.
+        folder: for checkpoints and walks; an interrupted run resumes from it.
+        robot: the robot that walks; its teacher labels.
+        walks: walks to begin with.
+        settings: number and size of the rounds.
+        seed: of rooms, initial weights and the split.
+        variant: of the navigator.
     """
-    for number in range(settings.rounds):
-        walks = walks + _round(folder, robot, walks, settings, seed, number, variant)
+    for number in range(settings.dagger_rounds):
+        walks = walks + _run_round(folder, robot, walks, settings, seed=seed, number=number, variant=variant)
     return walks
 
 
-def tempered(
+def select_turn_gain(
     folder: Path,
     robot: closed_loop.Params,
-    fit: behaviour_cloning.Fit,
+    fit: behaviour_cloning.FitResult,
     test: Sequence[Walk],
     settings: TrainSettings,
+    *,
     seed: int,
-) -> tuple[navigator.Params, list[dict[str, Any]]]:
-    """Choose the caution with which a navigator comes least often too near to something; the least of equals.
+) -> tuple[navigator.Params, list[JsonObject]]:
+    """Choose the turn gain with the fewest approaches per distance; the smallest gain if several have equally few.
 
     Args:
-        folder: for the walks, one a caution, all in the same rooms. test: stretches of walking to measure its turns on.
-        settings: the cautions, and how many robots walk for how long.
+        folder: for the walks with each gain, all in the same rooms.
+        robot: the robot that walks.
+        fit: its navigator.
+        test: segments on which the navigator's turns are measured.
+        settings: the gains, and how many robots walk for how long. Without gains no robot walks and `TURN_GAIN` holds.
+        seed: of the rooms.
 
     Returns:
-        The navigator, and a row a caution: whether it is the chosen one, how often it came nearer than `TIGHT`, in how
-        much of a way. Where there is nothing to choose from, nothing is walked.
+        The rescaled navigator, and a row per gain, as the stage `train` stores it: `caution` (the gain), `chosen`,
+        `tight` (approaches), `collisions` and `distance`.
     """
-    if not settings.cautions:
-        return behaviour_cloning.enliven(fit.best, test), [{"caution": behaviour_cloning.CAUTION, "chosen": True}]
-    rooms = room_batches.random_rooms(jax.random.fold_in(jax.random.key(seed), TRYOUT), settings.robots)
-    rows, tried = [], []
-    for caution in settings.cautions:
-        tried.append(behaviour_cloning.enliven(fit.best, test, caution))
-        pupil = assembly.manned(robot, tried[-1])
-        facts = {"caution": caution, "seconds": settings.round_seconds, "robot": assembly.digest(pupil)}
-        how = {"seed": seed, "facts": facts, "label": f"caution {caution:g}"}
-        place = folder / "walks" / f"caution-{caution:g}"
-        record = recording.walked(place, pupil, rooms, settings.round_seconds, policies.LEARNED, **how)
+    if not settings.turn_gains:
+        row = {"caution": behaviour_cloning.TURN_GAIN, "chosen": True}
+        return behaviour_cloning.rescale_turns(fit.best, test), [row]
+    rooms = room_batches.random_rooms(jax.random.fold_in(jax.random.key(seed), TURN_GAIN_EPISODE), settings.robots)
+    rows, candidates = [], []
+    for turn_gain in settings.turn_gains:
+        candidates.append(behaviour_cloning.rescale_turns(fit.best, test, turn_gain))
+        record = _walk_with_gain(folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed)
         score = metrics.score(record, cpg.CYCLE_TIME)
-        row = {"caution": caution, "tight": approaches(record)}
+        row = {"caution": turn_gain, "tight": count_approaches(record)}
         rows.append(row | {"collisions": score.collisions, "distance": score.distance})
-    least = min(range(len(rows)), key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
-    return tried[least], [row | {"chosen": k == least} for k, row in enumerate(rows)]
+    best = min(range(len(rows)), key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
+    return candidates[best], [row | {"chosen": k == best} for k, row in enumerate(rows)]
 
 
-def approaches(record: closed_loop.Record) -> int:
-    """Count the times that robots came nearer to something than `TIGHT`; the next is after they were twice as far.
+def count_approaches(record: closed_loop.Record) -> int:
+    """Count how often robots came nearer to anything than `APPROACH_CLEARANCE`.
 
-    Legs sway by centimetres with every step: a robot that turns beside a wall crosses a single bound a dozen times.
+    An approach ends when the robot is twice as far away, or is reset. The legs sway by centimetres with every step, so
+    that a robot turning beside a wall crosses a single threshold a dozen times.
     """
-    clearance, fresh = np.asarray(record.clearance), np.asarray(record.fresh)
-    tight, free = clearance < TIGHT, (clearance > 2 * TIGHT) | fresh
-    return sum(
-        int(np.sum(np.diff(near[near | far].astype(int), prepend=0) > 0)) for near, far in zip(tight, free, strict=True)
-    )
+    clearance, is_first = np.asarray(record.clearance), np.asarray(record.is_first)
+    near, far = clearance < APPROACH_CLEARANCE, (clearance > 2 * APPROACH_CLEARANCE) | is_first
+    phases = (n[n | f] for n, f in zip(near, far, strict=True))  # of each robot, without the frames in between
+    return sum(int(np.sum(np.diff(phase.astype(int), prepend=0) > 0)) for phase in phases)
 
 
-def practised(folder: Path) -> list[Walk]:
-    """Read the walks of all rounds of a finished practice."""
-    rounds = sorted((folder / "walks").glob("round-*"), key=lambda place: int(place.name.partition("-")[2]))
-    return [walk for number, place in enumerate(rounds) for walk in _numbered(place, number)]
+def read_rounds(folder: Path) -> list[Walk]:
+    """Read the walks of all rounds in the folder of a finished `run`."""
+    rounds = sorted((folder / "walks").glob("round-*"), key=lambda path: int(path.name.partition("-")[2]))
+    return [walk for number, path in enumerate(rounds) for walk in _read_round(path, number)]
 
 
-def recorded_by(inputs: Mapping[str, Path]) -> list[Walk]:
-    """Read all that the run recorded: the teacher's walks and the navigator's own."""
+def read_all_walks(inputs: Mapping[str, Path]) -> list[Walk]:
+    """Read all walks of a run folder: the teacher's demonstrations and the navigator's own walks."""
     if "collect" not in inputs:
-        raise InputError("expected a run whose walks pupils can learn from, got none; name one with --run")
-    return episodes.read(inputs["collect"] / "episodes") + practised(inputs["train"])
+        raise InputError("expected a run with recorded walks to train on, got none; name one with --run")
+    return episodes.read(inputs["collect"] / "episodes") + read_rounds(inputs["train"])
 
 
-def split(walks: Sequence[Walk], seed: int) -> tuple[list[Walk], list[Walk], list[Walk]]:
-    """Part stretches by their rooms: those to learn from, those to choose the best epoch by, those to judge by."""
-    train, kept = sequences.split_by_room(walks, KEPT_BACK, seed)
-    return train, *sequences.split_by_room(kept, 0.5, seed)
+def split_rooms(walks: Sequence[Walk], seed: int) -> tuple[list[Walk], list[Walk], list[Walk]]:
+    """Split segments by room into training data, test data (choose the best epoch) and unseen data (score the fit)."""
+    train, held_out = sequences.split_by_room(walks, HELD_OUT_FRACTION, seed)
+    return train, *sequences.split_by_room(held_out, 0.5, seed)
 
 
-def _round(
-    folder: Path, robot: closed_loop.Params, walks: list[Walk], settings: TrainSettings, seed: int, number: int,
-    variant: navigator.Variant,
-) -> list[Walk]:  # fmt: skip
-    """Fit the navigator to all walks so far, let it drive one episode, and return all that it walked, labelled."""
-    place = folder / "walks" / f"round-{number}"
-    if not recording.has_walked(place, settings.robots):
-        train, test = sequences.split_by_room(episodes.stretches(walks), KEPT_BACK, seed)
+def _run_round(
+    folder: Path,
+    robot: closed_loop.Params,
+    walks: list[Walk],
+    settings: TrainSettings,
+    *,
+    seed: int,
+    number: int,
+    variant: names.Variant,
+) -> list[Walk]:
+    """Fit the navigator to all walks so far, roll it out for one episode, and return its labelled walks."""
+    path = folder / "walks" / f"round-{number}"
+    if not recording.is_recorded(path, settings.robots):
+        train, test = sequences.split_by_room(episodes.segments(walks), HELD_OUT_FRACTION, seed)
         fit = behaviour_cloning.fit(
             navigator.create(jax.random.key(seed), variant),
             train,
@@ -154,15 +188,53 @@ def _round(
             behaviour_cloning.Settings(epochs=settings.round_epochs),
             checkpoints=folder / "checkpoints" / f"round-{number}",
         )
-        pupil = assembly.manned(robot, behaviour_cloning.enliven(fit.best, test))
-        facts = {"seconds": settings.round_seconds, "round": number, "robot": assembly.digest(pupil)}
-        how = {"seed": seed, "facts": facts, "label": f"practice {number + 1} of {settings.rounds}"}
-        rooms = room_batches.rooms_of(seed, OWN_WALKS + number, settings.robots)
-        recording.walked(place, pupil, rooms, settings.round_seconds, policies.LEARNED, **how)
-    return _numbered(place, number)
+        learner = assembly.with_policy(robot, "learned", behaviour_cloning.rescale_turns(fit.best, test))
+        recording.record_rollouts(
+            path,
+            learner,
+            room_batches.training_rooms(seed, FIRST_LEARNER_EPISODE + number, settings.robots),
+            settings.round_seconds,
+            policies.LEARNED,
+            seed=seed,
+            parameters={
+                "seconds": settings.round_seconds,
+                "round": number,
+                "robot": assembly.fingerprint(learner),
+            },
+            label=f"DAgger round {number + 1} of {settings.dagger_rounds}",
+        )
+    return _read_round(path, number)
 
 
-def _numbered(place: Path, number: int) -> list[Walk]:
-    """Read the walks of a round, and number their rooms apart from those of any other."""
-    walks, episode = episodes.read(place), OWN_WALKS + number
+def _walk_with_gain(
+    folder: Path,
+    robot: closed_loop.Params,
+    params: navigator.Params,
+    rooms: closed_loop.Room,
+    settings: TrainSettings,
+    *,
+    turn_gain: float,
+    seed: int,
+) -> closed_loop.Record:
+    """Record walks of a navigator whose turns were rescaled."""
+    learner = assembly.with_policy(robot, "learned", params)
+    return recording.record_rollouts(
+        folder / "walks" / f"caution-{turn_gain:g}",
+        learner,
+        rooms,
+        settings.round_seconds,
+        policies.LEARNED,
+        seed=seed,
+        parameters={
+            "caution": turn_gain,
+            "seconds": settings.round_seconds,
+            "robot": assembly.fingerprint(learner),
+        },
+        label=f"turn gain {turn_gain:g}",
+    )
+
+
+def _read_round(path: Path, number: int) -> list[Walk]:
+    """Read the walks of a round, with room numbers that differ from those of all other rounds."""
+    walks, episode = episodes.read(path), FIRST_LEARNER_EPISODE + number
     return [replace(walk, episode=episode, room=episode * len(walks) + walk.room) for walk in walks]

@@ -1,193 +1,226 @@
-"""Tune a robot's nerves while it walks, by the imitation loss (`lgmdjax.learning.rollout_gradient`); tell how far to
-trust its slope.
+"""Fine-tune a controller while the robot walks, by the gradient of the imitation loss; measure its noise as well.
 
-Adam follows the mean gradient of a crowd, window after window, room after room. Changes are shares of the parameters'
-sizes: the constants of detector and rhythm are changed by factors, so that they keep their sign and zeros stay zeros,
-weights by addition. The legs of both sides are tuned as one, so that what walked mirrored goes on to.
+Adam follows the mean gradient of a batch of robots (`lgmdjax.learning.rollout_gradient`), window after window and room
+after room. Each update is in units of `param_scales`. The constants of LGMD and CPG are multiplied by a factor, so that
+their sign is kept and zeros stay zero; weights are changed by addition. Left and right legs share their update, so that
+a mirror-symmetric gait stays symmetric.
 
-| symbol | name   | unit                 | meaning                                                              |
-| ------ | ------ | -------------------- | -------------------------------------------------------------------- |
-| L      | loss   | nominal^2            | of the window, mean over robots                                      |
-| g      | signal | nominal^2 by a share | norm of the mean of their gradients                                  |
-| s      | noise  | nominal^2 by a share | root of the mean's variance, as they differ; were the true gradient  |
-|        |        |                      | none, g would be about s                                             |
+| symbol | name   | unit                      | meaning                                                              |
+| ------ | ------ | ------------------------- | -------------------------------------------------------------------- |
+| L      | loss   | nominal^2                 | of the window, mean over robots                                      |
+| g      | signal | nominal^2 per param_scale | norm of the robots' mean gradient                                    |
+| s      | noise  | nominal^2 per param_scale | standard error of that mean; g is about s if the true gradient is 0  |
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
-from mujoco import mjx
+from jaxtyping import Array, Float, Int, PyTree
 
 from lgmdjax.control import controller, policies
 from lgmdjax.errors import InputError
 from lgmdjax.learning import rollout_gradient
-from lgmdjax.learning.checkpoints import Checkpoints
+from lgmdjax.learning.checkpoints import Checkpoints, resumable
 from lgmdjax.locomotion import shaping
+from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import rollout
-from lgmdjax.simulation.closed_loop import Params, Record, Room
+from lgmdjax.simulation.closed_loop import Params, Record, Room, State
 
-FACTORS = ("lgmd", "cpg")  # whose constants are changed by factors
+MULTIPLICATIVE = ("lgmd", "cpg")  # parts of the controller whose constants are updated by a factor
+
+Update = Callable[[controller.Params, optax.OptState, PyTree], tuple[controller.Params, optax.OptState]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
     """How to follow the gradient."""
 
-    learning_rate: float = 1e-3  # of parameters as shares of their sizes; falls to nothing like half a cosine
-    windows: int = 30  # in a room, before robots go on to others
+    learning_rate: float = 1e-3  # in units of param_scales; decays to zero along half a cosine
+    windows_per_room: int = 30  # before the robots continue in other rooms
     rooms: int = 4  # of each robot, one after the other
-    parts: tuple[str, ...] = ("driver",)  # of `controller.Params` that are tuned, also such as "lgmd.threshold"
+    trainable: tuple[str, ...] = ("policy",)  # parts of `controller.Params`, or leaves such as "lgmd.threshold"
 
 
-class Row(NamedTuple):
-    """What is told of a window."""
+class WindowStats(NamedTuple):
+    """Statistics of one window; norms are in units of param_scales, and of trainable parameters only."""
 
     loss: float
-    signal: float  # norm of the mean gradient, in shares of the sizes of what is tuned
-    noise: float  # root of its variance: norm that it would have by chance alone
-    norm: float  # of one robot's gradient, the middle one
-    largest: float
-    lost: float  # robots whose loss or gradient was not finite
-    fallen: float  # robots, at its end
-    touches: float
+    signal: float  # norm of the mean gradient
+    noise: float  # its standard error: the norm expected by chance if the true gradient is zero
+    median_norm: float  # of the robots' gradients
+    max_norm: float
+    nonfinite: float  # robots whose loss or gradient was not finite
+    fallen: float  # robots that had fallen at the end
+    contacts: float  # frames with contact, over all robots
 
 
 @struct.dataclass(kw_only=True)
 class Progress:
-    """Where a tune is, between two rooms."""
+    """The state of a fine-tuning run between two rooms."""
 
-    nerves: controller.Params
-    optimiser: Any
-    rooms: Int[Array, ""]  # done
-    rows: Float[Array, "windows columns"]  # `Row`s; nan where there has been none
+    controller_params: controller.Params
+    optimiser: optax.OptState
+    rooms: Int[Array, ""]  # finished
+    rows: Float[Array, "windows columns"]  # `WindowStats` of all windows; nan for those to come
 
 
-def tune(
+def finetune(
     params: Params,
     model: mjx.Model,
-    rooms: Callable[[int], Room],
-    window: rollout_gradient.Settings,
+    sample_rooms: Callable[[int], Room],
+    gradient_settings: rollout_gradient.Settings,
     settings: Settings,
     *,
-    saved: Checkpoints | None = None,
-    tell: Callable[[Row], None] = lambda row: None,
-) -> tuple[Params, list[Row]]:
-    """Follow the gradient of the imitation loss (Adam) while the robots walk, window after window.
+    checkpoints: Checkpoints | None = None,
+    on_window: Callable[[WindowStats], None] = lambda stats: None,
+) -> tuple[Params, list[WindowStats]]:
+    """Follow the gradient of the imitation loss with Adam while the robots walk; return the robot and all statistics.
 
     Args:
-        params: a robot with the navigator alone at the wheel. rooms: of the crowd, by number.
-        window: through which a derivative goes. settings: see there.
-        saved: where progress is kept after every room, and carried on from: the result is the same, bit for bit.
-        tell: told of every window.
-
-    Returns:
-        The robot, and a row a window.
+        params: a robot with the navigator as its only policy (`rollout_gradient.learned_only`).
+        model: the body in MJX.
+        sample_rooms: returns a batch of rooms by number, one room per robot.
+        gradient_settings: of a window and its derivative.
+        settings: of the optimiser.
+        checkpoints: where progress is saved after every room and resumed from; the result is the same, bit for bit.
+        on_window: called with the statistics of every window.
     """
-    whole, steps = sizes(params.controller, settings.parts), settings.windows * settings.rooms
-    # What keeps Adam from dividing by zero must be small beside all slopes.
+    scales, steps = param_scales(params.controller, settings.trainable), settings.windows_per_room * settings.rooms
+    # Adam's epsilon must be small beside every derivative.
     optimiser = optax.adam(optax.cosine_decay_schedule(settings.learning_rate, steps), eps=1e-15)
-    update = _follower(optimiser, whole)
+    update = _make_update(optimiser, scales)
 
-    def practise(done: Progress, here: Room) -> Progress:
-        nerves, state, rows = done.nerves, done.optimiser, []
-        states = rollout.start(replace(params, controller=nerves), model, here, driver=policies.LEARNED)
-        for _ in range(settings.windows):
-            own = replace(params, controller=nerves)
-            found, states, record = rollout_gradient.gradient(own, model, here, states, whole, settings=window)
-            # By way of the host: a gradient is laid out over the devices of the crowd, parameters are not.
-            nerves, state = update(nerves, state, jax.device_get(found.slope))
-            rows.append(_row(found, record))
-            tell(rows[-1])
-        first = int(done.rooms) * settings.windows
-        filled = done.rows.at[first : first + len(rows)].set(jnp.asarray(rows, float))
-        return Progress(nerves=nerves, optimiser=state, rooms=done.rooms + 1, rows=filled)
+    def finetune_in_room(progress: Progress, number: int, _: int) -> Progress:
+        rooms, robot = sample_rooms(number), replace(params, controller=progress.controller_params)
+        states = rollout.reset_batch(robot, model, rooms, policy=policies.LEARNED)
 
-    nothing = jnp.full((steps, len(Row._fields)), jnp.nan)
-    nerves: Any = params.controller
-    done = Progress(nerves=nerves, optimiser=optimiser.init(nerves), rooms=jnp.asarray(0, jnp.int32), rows=nothing)
-    done = done if saved is None else saved.latest(done)
-    for number in range(int(done.rooms), settings.rooms):
-        done = practise(done, rooms(number))
-        if saved is not None:
-            saved.save(number + 1, done)
-    return replace(params, controller=done.nerves), [Row(*row) for row in np.asarray(done.rows).tolist()]
+        def gradient(own: controller.Params, states: State) -> tuple[rollout_gradient.Gradient, State, Record]:
+            robot = replace(params, controller=own)
+            return rollout_gradient.gradient(robot, model, rooms, states, scales, settings=gradient_settings)
+
+        return _follow(progress, states, gradient, update, windows=settings.windows_per_room, on_window=on_window)
+
+    initial = _initial_progress(params.controller, optimiser, steps)
+    *_, (_, progress) = resumable(finetune_in_room, initial, checkpoints, total=settings.rooms)
+    stats = [WindowStats(*row) for row in np.asarray(progress.rows).tolist()]
+    return replace(params, controller=progress.controller_params), stats
 
 
-def _follower(optimiser: optax.GradientTransformation, sizes: controller.Params) -> Callable[..., Any]:
-    """Make what follows a slope by a step: nerves, state of the optimiser, slope -> nerves, state."""
+def param_scales(controller_params: controller.Params, trainable: tuple[str, ...]) -> controller.Params:
+    """Return the scale in which each parameter is updated; zero if it is not trainable.
+
+    The scale of a constant of LGMD or CPG is its magnitude, that of a weight the root mean square of its array.
+    Scaling constants of the navigator and widths of smooth thresholds are never trained.
+
+    Raises InputError for a name in `trainable` that is not in the controller.
+    """
+    names = [_name(path) for path, _ in jax.tree_util.tree_leaves_with_path(controller_params)]
+    for part in trainable:
+        if not any(_is_part_of(name, part) for name in names):
+            raise InputError(
+                f"trainable parameters: expected some of {', '.join(names)}, or a group of them such as shaping, "
+                f"got {part}; choose from these"
+            )
+
+    def scale(path: tuple[object, ...], leaf: Float[Array, "*shape"]) -> Float[Array, "*scale"]:
+        name = _name(path)
+        own = jnp.abs(leaf) if name.partition(".")[0] in MULTIPLICATIVE else jnp.sqrt(jnp.mean(leaf**2)) + 1e-3
+        fixed = name.rpartition(".")[2].startswith(("input_", "output_")) or name.endswith("_width")
+        return own if any(_is_part_of(name, part) for part in trainable) and not fixed else jnp.zeros_like(own)
+
+    return jax.tree_util.tree_map_with_path(scale, controller_params)
+
+
+def apply_update(
+    controller_params: controller.Params, updates: controller.Params, param_scales: controller.Params
+) -> controller.Params:
+    """Add updates in units of `param_scales` to weights; multiply the constants of LGMD and CPG by exp(update)."""
+    added = jax.tree.map(lambda leaf, update, scale: leaf + update * scale, controller_params, updates, param_scales)
+    multiplied = jax.tree.map(lambda leaf, update: leaf * jnp.exp(update), controller_params, updates)
+    return replace(added, **{name: getattr(multiplied, name) for name in MULTIPLICATIVE})
+
+
+def symmetrise(grad: controller.Params) -> controller.Params:
+    """Average the gradient of the legs with its mirror image, so that a mirror-symmetric gait stays symmetric."""
+    legs = jax.tree.map(lambda own, image: (own + image) / 2, grad.shaping, shaping.mirror(grad.shaping))
+    W = grad.cpg.coupling
+    return replace(grad, shaping=legs, cpg=replace(grad.cpg, coupling=(W + W[::-1, ::-1]) / 2))
+
+
+def _initial_progress(
+    controller_params: controller.Params, optimiser: optax.GradientTransformation, steps: int
+) -> Progress:
+    weights: PyTree = controller_params
+    return Progress(
+        controller_params=controller_params,
+        optimiser=optimiser.init(weights),
+        rooms=jnp.asarray(0, jnp.int32),
+        rows=jnp.full((steps, len(WindowStats._fields)), jnp.nan),
+    )
+
+
+def _follow(
+    progress: Progress,
+    states: State,
+    gradient: Callable[[controller.Params, State], tuple[rollout_gradient.Gradient, State, Record]],
+    update: Update,
+    *,
+    windows: int,
+    on_window: Callable[[WindowStats], None],
+) -> Progress:
+    """Walk all windows in one room, with an update after each."""
+    controller_params, memory, rows = progress.controller_params, progress.optimiser, []
+    for _ in range(windows):
+        found, states, record = gradient(controller_params, states)
+        # Through the host, since a gradient is sharded over the robots' devices and parameters are not.
+        controller_params, memory = update(controller_params, memory, jax.device_get(found.grad))
+        rows.append(_summarise(found, record))
+        on_window(rows[-1])
+    first = int(progress.rooms) * windows
+    filled = progress.rows.at[first : first + len(rows)].set(jnp.asarray(rows, float))
+    return Progress(controller_params=controller_params, optimiser=memory, rooms=progress.rooms + 1, rows=filled)
+
+
+def _make_update(optimiser: optax.GradientTransformation, scales: controller.Params) -> Update:
+    """Return a jitted step of the optimiser: (parameters, optimiser's state, gradient) -> (parameters, state)."""
 
     @jax.jit
-    def update(nerves: controller.Params, state: Any, slope: controller.Params) -> tuple[controller.Params, Any]:
-        both: Any = tied(slope)
-        changes: Any
-        changes, state = optimiser.update(both, state)
-        return moved(nerves, changes, sizes), state
+    def update(
+        controller_params: controller.Params, memory: optax.OptState, grad: PyTree
+    ) -> tuple[controller.Params, optax.OptState]:
+        symmetric: PyTree = symmetrise(grad)
+        updates: PyTree
+        updates, memory = optimiser.update(symmetric, memory)
+        return apply_update(controller_params, updates, scales), memory
 
     return update
 
 
-def sizes(nerves: controller.Params, parts: tuple[str, ...]) -> controller.Params:
-    """Measure what a share of each parameter is a share of, zero where it is not tuned.
-
-    A constant of detector or rhythm has its own size, a weight the root mean square of its kind. Means and deviations
-    of the data, and the widths of smooth steps, are never tuned.
-
-    Raises InputError for a part that there is not.
-    """
-    names = [_name(path) for path, _ in jax.tree_util.tree_leaves_with_path(nerves)]
-    for part in parts:
-        if not any(_within(name, part) for name in names):
-            raise InputError(f"tuning parts: expected some of {', '.join(names)}, or what they are of, got {part}")
-
-    def size(path: Any, leaf: Float[Array, "*shape"]) -> Float[Array, "*size"]:
-        own = jnp.abs(leaf) if path[0].name in FACTORS else jnp.sqrt(jnp.mean(leaf**2)) + 1e-3
-        name = _name(path)
-        fixed = name.rpartition(".")[2].startswith(("input_", "output_")) or name.endswith("_width")
-        return own if any(_within(name, part) for part in parts) and not fixed else jnp.zeros_like(own)
-
-    return jax.tree_util.tree_map_with_path(size, nerves)
-
-
-def moved(nerves: controller.Params, changes: controller.Params, sizes: controller.Params) -> controller.Params:
-    """Change parameters by shares of their sizes: constants of detector and rhythm by factors, weights by addition."""
-    added = jax.tree.map(lambda leaf, change, size: leaf + change * size, nerves, changes, sizes)
-    grown = jax.tree.map(lambda leaf, change: leaf * jnp.exp(change), nerves, changes)
-    return replace(added, **{name: getattr(grown, name) for name in FACTORS})
-
-
-def tied(slope: controller.Params) -> controller.Params:
-    """Take the mean of a slope of the legs and its mirror image, by which what walked mirrored goes on to."""
-    legs = jax.tree.map(lambda own, image: (own + image) / 2, slope.shaping, shaping.mirror(slope.shaping))
-    W = slope.cpg.coupling
-    return replace(slope, shaping=legs, cpg=replace(slope.cpg, coupling=(W + W[::-1, ::-1]) / 2))
-
-
-def _row(found: rollout_gradient.Gradient, record: Record) -> Row:
-    sound, ok = np.asarray(found.norms)[~np.asarray(found.lost)], np.asarray(record.ok)
-    middle, largest = (float(np.quantile(sound, at)) if sound.size else math.nan for at in (0.5, 1.0))
-    return Row(
+def _summarise(found: rollout_gradient.Gradient, record: Record) -> WindowStats:
+    finite, ok = np.asarray(found.norms)[~np.asarray(found.nonfinite)], np.asarray(record.ok)
+    median, largest = (float(np.quantile(finite, q)) if finite.size else math.nan for q in (0.5, 1.0))
+    return WindowStats(
         loss=float(found.loss),
-        signal=float(optax.tree.norm(found.slope)),
-        noise=float(found.noise),
-        norm=middle,
-        largest=largest,
-        lost=int(found.lost.sum()),
+        signal=float(optax.tree.norm(found.grad)),
+        noise=float(found.standard_error),
+        median_norm=median,
+        max_norm=largest,
+        nonfinite=int(found.nonfinite.sum()),
         fallen=int((~ok[:, -1]).sum()),
-        touches=int((np.asarray(record.contact) & ok).sum()),
+        contacts=int((np.asarray(record.contact) & ok).sum()),
     )
 
 
-def _name(path: Any) -> str:
+def _name(path: tuple[object, ...]) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
-def _within(name: str, part: str) -> bool:
+def _is_part_of(name: str, part: str) -> bool:
     return f"{name}.".startswith(f"{part}.")

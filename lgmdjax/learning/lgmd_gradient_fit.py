@@ -1,233 +1,264 @@
-"""The LGMD fitted to recorded walks: the imitation loss, differentiated through navigator and detector.
+"""Fit the LGMD to recorded walks by gradient: the imitation loss, differentiated through navigator and detector.
 
-What the cells of an eye see has no parameter that is fitted. So walks are drawn again once
-(`lgmdjax.simulation.rerender`), pooled, and only the changes from frame to frame are kept; from two of them follow S,
-U, FF and u, and from u the loss
+Nothing before the frame differences has a fitted parameter. Recorded walks are therefore rendered and pooled only once
+(`lgmdjax.simulation.rerender`), and only the differences between frames are kept. S, U, FF and u follow from two
+consecutive differences, and from u the loss
 
     L = mean over a window's frames and both sides of |v - v*|^2.
 
-States go on into the next window, without their derivative. Steps are sigmoids while fitting, and narrow from
-`WIDTHS[0]` of T_s and T_f to `WIDTHS[1]`.
+States are passed on to the next window without their derivative. During the fit, thresholds are sigmoids whose width
+shrinks from `SMOOTH_WIDTHS[0]` to `SMOOTH_WIDTHS[1]`, relative to T_s and T_f.
 
-| symbol        | name                  | unit      | equation |
-| ------------- | --------------------- | --------- | -------- |
-| P_f, P_{f-1}  | cells.change, .before | grey      | 7        |
-| u             | `respond`             | 1, 0.5..1 | 14, 16   |
-| v             | velocity              | nominal   | 17       |
-| v*            | tape.label            | nominal   | 22       |
-| L             | loss                  | nominal^2 | sec. 5.1 |
+| symbol       | name                            | unit      | equation |
+| ------------ | ------------------------------- | --------- | -------- |
+| P_f, P_{f-1} | differences.current, .previous  | grey      | 7        |
+| u            | result of `respond`             | 1, 0.5..1 | 14, 16   |
+| v            | velocity                        | nominal   | 17       |
+| v*           | sequences.label                 | nominal   | 22       |
+| L            | loss                            | nominal^2 | sec. 5.1 |
 
-Fitted are the logarithms of T_s, T_f and W_I, and w_I in units of `SIZE`, kept from becoming negative. W_I times the
-sum of w_I is one number; `normal` gives w_I the sum that it has in the paper.
+Fitted are the logarithms of T_s, T_f and W_I, and w_I in units of `KERNEL_RMS`, projected to non-negative values. Only
+the product of W_I and the sum of w_I matters; `normalise_kernel` sets that sum to the paper's.
 
-Gradient: by all of these, and by the navigator's weights. Of hard steps T_s and T_f have none.
+Gradient: by all of these, and by the navigator's weights; zero by T_s and T_f if thresholds are hard.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 from tqdm import tqdm
 
 from lgmdjax.control import navigator
 from lgmdjax.detectors import lgmd
 from lgmdjax.learning import behaviour_cloning, sequences
 from lgmdjax.learning.settings import LgmdGradientSettings
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import episodes
-from lgmdjax.simulation.closed_loop import FRAME_RATE, Leaf
+from lgmdjax.simulation.closed_loop import FRAME_RATE, AnyArray
 from lgmdjax.simulation.episodes import Walk
 
 SCALARS = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
 PARTS = ("detector", "navigator")
-WIDTHS = (0.3, 0.03)  # of the sigmoids, as shares of T_s and T_f: at first and at last
-LEAST = 1e-3  # what a constant must be to have a logarithm
-TOTAL = float(np.sum(lgmd.KERNEL))
-SIZE = float(np.sqrt(np.mean(np.square(lgmd.KERNEL))))  # of a weight of the kernel
-CLIP = 1.0  # largest norm of a gradient
-SLIGHT = 1e-5  # a slope that is none: that of a gate that stands open must not be made large
+SMOOTH_WIDTHS = (0.3, 0.03)  # of the sigmoids, relative to T_s and T_f: first and last
+MIN_CONSTANT = 1e-3  # least constant whose logarithm is taken
+KERNEL_SUM = float(np.sum(lgmd.KERNEL))
+KERNEL_RMS = float(np.sqrt(np.mean(np.square(lgmd.KERNEL))))  # of the kernel's weights
+MAX_GRAD_NORM = 1.0
+ADAM_EPS = 1e-5  # keeps Adam from amplifying derivatives that are practically zero, as by T_f without suppression
 
 
 @struct.dataclass(kw_only=True)
-class Pilot:
-    """A detector, and the navigator that listens to it."""
+class LgmdNavigator:
+    """Parameters of a detector and of the navigator that gets its u."""
 
     detector: lgmd.Params
     navigator: navigator.Params
 
 
 @struct.dataclass(kw_only=True)
-class Cells:
-    """How what the cells of both eyes see changed [grey]: all that the detector knows of the world."""
+class FrameDifferences:
+    """Differences of pooled images, of both eyes [grey]: the whole input of the detector."""
 
-    change: Float[Leaf, "*walks frames 2 rows columns"]
-    before: Float[Leaf, "*walks frames 2 rows columns"]
+    current: Float[AnyArray, "*walks frames 2 rows columns"]
+    previous: Float[AnyArray, "*walks frames 2 rows columns"]
 
 
 @struct.dataclass(kw_only=True)
-class Film:
-    """Walks to fit to: stretches end to end, in streams that are walked side by side."""
+class LgmdBatch:
+    """Training data: frame differences, and everything else as `behaviour_cloning` uses it."""
 
-    cells: Cells  # axes (window, frame, stream, eye, row, column)
-    tape: sequences.Tape
-
-
-Judge = Callable[[Pilot], Mapping[str, Any]]  # looks at walks kept back; "choice" is what the best step has least of
+    differences: FrameDifferences  # axes (window, frame, stream, eye, row, column)
+    sequences: sequences.SequenceBatch
 
 
-def changes(seen: Float[Leaf, "walks frames 2 rows columns"], fresh: Leaf) -> Cells:
-    """Take the differences of what cells saw; none where a robot was just put down, nor on the first picture.
+Evaluate = Callable[[LgmdNavigator], Mapping[str, float]]
+"""Returns errors on held-out walks; the fit's result is the step with the lowest "choice"."""
 
-    What a walk that is cut out of a longer one says in its first two frames is therefore not what the whole one does.
-    `episodes.stretches` leaves them out.
+FitParams = Mapping[str, PyTree]
+"""Fitted parameters by the names of `PARTS`, in the coordinates of the optimiser."""
+
+
+def frame_differences(images: Float[AnyArray, "walks frames 2 rows columns"], is_first: AnyArray) -> FrameDifferences:
+    """Return the differences of pooled images; zero at the first frame of a walk and after a reset.
+
+    A walk cut out of a longer one therefore has other responses in its first two frames. `episodes.segments` leaves
+    these out.
     """
-    seen, opened = np.asarray(seen), np.array(fresh)[..., None, None, None]
-    opened[:, 0] = True
-    change = np.where(opened, 0, np.diff(seen, axis=1, prepend=seen[:, :1]))
-    before = np.where(opened, 0, np.roll(change, 1, axis=1))
-    return Cells(change=change.astype(seen.dtype), before=before.astype(seen.dtype))
+    images, restarted = np.asarray(images), np.array(is_first)[..., None, None, None]
+    restarted[:, 0] = True
+    current = np.where(restarted, 0, np.diff(images, axis=1, prepend=images[:, :1]))
+    previous = np.where(restarted, 0, np.roll(current, 1, axis=1))
+    return FrameDifferences(current=current.astype(images.dtype), previous=previous.astype(images.dtype))
 
 
-def respond(detector: lgmd.Params, cells: Cells) -> Float[Array, "*walks frames 2"]:
-    """Give u of every frame and eye (eqs. 8-16): a change is what a picture differs from a black one by."""
+def respond(detector: lgmd.Params, differences: FrameDifferences) -> Float[Array, "*walks frames 2"]:
+    """Return u of every frame and eye (eqs. 8-16); a difference is that of an image from a black one."""
     detector = replace(detector, pooling=1)
 
-    def eye(P: Float[Array, "rows columns"], before: Float[Array, "rows columns"]) -> Float[Array, ""]:
-        return lgmd.step(detector, lgmd.State(frame=jnp.zeros_like(P), difference=before), P)[1].u
+    def eye(current: Float[Array, "rows columns"], previous: Float[Array, "rows columns"]) -> Float[Array, ""]:
+        state = lgmd.State(frame=jnp.zeros_like(current), difference=previous)
+        return lgmd.step(detector, state, current)[1].u
 
-    change, before = (jnp.reshape(leaf, (-1, *leaf.shape[-2:])) for leaf in (cells.change, cells.before))
-    return jax.vmap(eye)(change, before).reshape(cells.change.shape[:-2])
+    current, previous = (
+        jnp.reshape(leaf, (-1, *leaf.shape[-2:])) for leaf in (differences.current, differences.previous)
+    )
+    return jax.vmap(eye)(current, previous).reshape(differences.current.shape[:-2])
 
 
 @jax.jit
-def watch(detector: lgmd.Params, cells: Cells) -> Float[Array, "walks frames 2"]:
-    """Give u of whole walks, as `respond` does, one after the other."""
-    return jax.lax.map(partial(respond, detector), jax.tree.map(jnp.asarray, cells))
+def respond_walks(detector: lgmd.Params, differences: FrameDifferences) -> Float[Array, "walks frames 2"]:
+    """Return u of whole walks, as `respond` does, one walk after the other to save memory."""
+    return jax.lax.map(partial(respond, detector), jax.tree.map(jnp.asarray, differences))
 
 
-def film(walks: Sequence[Walk], cells: Cells, streams: int, window: int, order: np.random.Generator) -> Film:
-    """Lay the stretches of walks end to end, in the order of luck, with what the cells saw on them."""
-    pieces = [(k, stretch) for k, walk in enumerate(walks) for stretch in episodes.stretches([walk])]
-    pieces = [pieces[k] for k in order.permutation(len(pieces))]
+def pack_walks(
+    walks: Sequence[Walk], differences: FrameDifferences, streams: int, window: int, generator: np.random.Generator
+) -> LgmdBatch:
+    """Concatenate the segments of walks in random order and cut them, with their differences, into parallel streams."""
+    segments = [(k, segment) for k, walk in enumerate(walks) for segment in episodes.segments([walk])]
+    segments = [segments[k] for k in generator.permutation(len(segments))]
     spans = []
-    for k, stretch in pieces:
-        first = round(float(stretch.time[0] - walks[k].time[0]) * FRAME_RATE)
-        spans.append((k, slice(first, first + len(stretch))))
+    for k, segment in segments:
+        first = round(float(segment.time[0] - walks[k].time[0]) * FRAME_RATE)
+        spans.append((k, slice(first, first + len(segment))))
 
-    def lay(leaf: Leaf) -> Array:
-        return jnp.asarray(
-            sequences.cut(np.concatenate([leaf[span] for span in spans]), streams=streams, window=window)
-        )
+    def pack(leaf: AnyArray) -> Array:
+        series = np.concatenate([leaf[span] for span in spans])
+        return jnp.asarray(sequences.to_streams(series, streams=streams, window=window))
 
-    tape = sequences.lay([piece for _, piece in pieces], np.zeros(2), streams=streams, window=window, mirrored=False)
-    return Film(cells=jax.tree.map(lay, cells), tape=tape)
-
-
-def parts(pilot: Pilot) -> dict[str, Any]:
-    """Name what can be fitted, by the names of `PARTS`, in the numbers that steps are made in."""
-    logs = {name: jnp.log(jnp.maximum(getattr(pilot.detector, name), LEAST)) for name in SCALARS}
-    return {"detector": logs | {"kernel": pilot.detector.kernel / SIZE}, "navigator": pilot.navigator.weights}
+    batch = sequences.pack(
+        [segment for _, segment in segments], np.zeros(2), streams=streams, window=window, mirrored=False
+    )
+    return LgmdBatch(differences=jax.tree.map(pack, differences), sequences=batch)
 
 
-def together(pilot: Pilot, parts: Mapping[str, Any]) -> Pilot:
-    """Put a pilot together from parts, its structure and constants those of another."""
-    constants = {name: jnp.exp(parts["detector"][name]) for name in SCALARS}
-    return Pilot(
-        detector=replace(pilot.detector, kernel=SIZE * parts["detector"]["kernel"], **constants),
-        navigator=replace(pilot.navigator, weights=parts["navigator"]),
+def to_fit_params(params: LgmdNavigator) -> dict[str, PyTree]:
+    """Return all parameters that can be fitted, in the coordinates of the optimiser."""
+    logs = {name: jnp.log(jnp.maximum(getattr(params.detector, name), MIN_CONSTANT)) for name in SCALARS}
+    return {"detector": logs | {"kernel": params.detector.kernel / KERNEL_RMS}, "navigator": params.navigator.weights}
+
+
+def from_fit_params(params: LgmdNavigator, fitted: FitParams) -> LgmdNavigator:
+    """Return `params` with its fitted parameters replaced; the inverse of `to_fit_params`."""
+    constants = {name: jnp.exp(fitted["detector"][name]) for name in SCALARS}
+    return LgmdNavigator(
+        detector=replace(params.detector, kernel=KERNEL_RMS * fitted["detector"]["kernel"], **constants),
+        navigator=replace(params.navigator, weights=fitted["navigator"]),
     )
 
 
-def normal(detector: lgmd.Params) -> lgmd.Params:
-    """Give w_I the symmetry that it is used with and the sum of eq. 9; what it had more goes into W_I."""
+def normalise_kernel(detector: lgmd.Params) -> lgmd.Params:
+    """Return the same detector with a symmetric w_I whose sum is that of eq. 9; the factor goes into W_I."""
     w = detector.kernel
     w = (w + w[::-1] + w[:, ::-1] + w[::-1, ::-1]) / 4
-    factor = jnp.maximum(jnp.sum(w), 1e-9) / TOTAL
+    factor = jnp.maximum(jnp.sum(w), 1e-9) / KERNEL_SUM
     return replace(detector, kernel=w / factor, inhibition=detector.inhibition * factor)
 
 
 def loss(
-    tuned: Mapping[str, Any], pilot: Pilot, states: navigator.State, film: Film, share: Float[Array, ""] | float
+    fitted: FitParams, params: LgmdNavigator, states: navigator.State, batch: LgmdBatch, width: Float[Array, ""] | float
 ) -> tuple[Float[Array, ""], navigator.State]:
-    """Walk one window; give the mean squared error of its commands, and the navigators' states at its end.
+    """Return the mean squared error of the commands in one window, and the navigators' states after it.
 
     Args:
-        tuned: what the derivative is asked of, in place of what `pilot` has.
-        states: of the navigator, one a stream. film: a window of it, without the axis of windows.
-        share: width of the sigmoids.
+        fitted: parameters to differentiate by; they replace those in `params`.
+        params: all other parameters.
+        states: of the navigators, one per stream.
+        batch: one window, without the axis of windows.
+        width: of the smooth thresholds, relative to them.
     """
-    own = together(pilot, {**parts(pilot), **tuned})
-    u = respond(lgmd.smoothed(own.detector, share), film.cells)
-    tape = replace(film.tape, u=u)
-    error, (_, states) = behaviour_cloning.window_error(own.navigator, own.navigator.weights, states, tape, told=False)
+    own = from_fit_params(params, {**to_fit_params(params), **fitted})
+    u = respond(lgmd.with_smooth_thresholds(own.detector, width), batch.differences)
+    error, (_, states) = behaviour_cloning.window_loss(
+        own.navigator, own.navigator.weights, states, replace(batch.sequences, u=u), command_feedback=False
+    )
     return error, states
 
 
-def start(pupil: navigator.Params, streams: int) -> navigator.State:
-    """Let the navigator of every stream begin with nothing remembered."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (streams, *leaf.shape)), navigator.init(pupil))
+def init_states(params: navigator.Params, streams: int) -> navigator.State:
+    """Return the initial state of a navigator for every stream."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (streams, *leaf.shape)), navigator.init(params))
 
 
 def fit(
-    pilot: Pilot, film: Film, names: Sequence[str], settings: LgmdGradientSettings, judge: Judge, label: str = "fit"
-) -> tuple[Pilot, list[dict[str, Any]]]:
-    """Follow the gradient of the loss (Adam), window after window; give the pilot of the step that is judged best.
+    params: LgmdNavigator,
+    batch: LgmdBatch,
+    parts: Sequence[str],
+    settings: LgmdGradientSettings,
+    evaluate: Evaluate,
+    *,
+    label: str = "fit",
+) -> tuple[LgmdNavigator, list[JsonObject]]:
+    """Follow the gradient of the loss with Adam, window after window; return the best parameters and the curve.
 
     Args:
-        pilot: to start from. names: of the `PARTS` that are fitted; of none, nothing is.
-        judge: asked at the start, every `settings.every` steps and at the end. label: for the progress bar.
+        params: initial parameters.
+        batch: training data.
+        parts: which of `PARTS` are fitted; without any, `params` are only evaluated.
+        settings: of the optimiser.
+        evaluate: called at the start, every `settings.eval_every` steps and at the end.
+        label: of the progress bar.
 
     Returns:
-        The pilot, and what was said of every one asked about: step, mean loss of the windows since the last, and what
-        the judge said.
+        The evaluated parameters with the lowest "choice", and a row per evaluation: `step`, `loss` (mean of the windows
+        since the last evaluation), and what `evaluate` returned.
     """
-    tuned = {name: parts(pilot)[name] for name in names}
-    optimiser, steps = _optimiser(names, settings), settings.steps if names else 0
-    memory, states, windows = optimiser.init(tuned), start(pilot.navigator, film.tape.fresh.shape[-1]), len(film.tape.u)
-
-    @jax.jit
-    def update(tuned: Any, memory: Any, states: navigator.State, film: Film, number: Int[Array, ""]):
-        window = jax.tree.map(lambda leaf: leaf[number % windows], film)
-        share = WIDTHS[0] * (WIDTHS[1] / WIDTHS[0]) ** (number / steps)
-        (error, states), slope = jax.value_and_grad(loss, has_aux=True)(tuned, pilot, states, window, share)
-        moves, memory = optimiser.update(slope, memory, tuned)
-        tuned = _allowed(optax.apply_updates(tuned, moves))
-        return tuned, memory, states, error
-
-    best, rows, errors = pilot, [], []
-    for number in tqdm(range(steps + 1), desc=label, unit="step"):
-        if number % settings.every == 0 or number == steps:
-            now = together(pilot, {**parts(pilot), **tuned})
-            rows.append({"step": number, "loss": float(np.mean(errors)) if errors else None, **judge(now)})
-            best = now if rows[-1]["choice"] <= min(row["choice"] for row in rows) else best
+    fitted = {name: to_fit_params(params)[name] for name in parts}
+    optimiser, steps = _optimiser(parts, settings), settings.steps if parts else 0
+    memory, states = optimiser.init(fitted), init_states(params.navigator, batch.sequences.is_first.shape[-1])
+    update = _make_update(params, optimiser, windows=len(batch.sequences.u), steps=steps)
+    best, rows, errors = params, [], []
+    for step in tqdm(range(steps + 1), desc=label, unit="step"):
+        if step % settings.eval_every == 0 or step == steps:
+            current = from_fit_params(params, {**to_fit_params(params), **fitted})
+            rows.append({"step": step, "loss": float(np.mean(errors)) if errors else None, **evaluate(current)})
+            best = current if rows[-1]["choice"] <= min(row["choice"] for row in rows) else best
             errors = []
-        if number < steps:
-            tuned, memory, states, error = update(tuned, memory, states, film, jnp.asarray(number, jnp.int32))
+        if step < steps:
+            fitted, memory, states, error = update(fitted, memory, states, batch, jnp.asarray(step, jnp.int32))
             errors.append(error)
     return best, rows
 
 
-def _optimiser(names: Sequence[str], settings: LgmdGradientSettings) -> optax.GradientTransformation:
-    """Cut the gradient of each part, and step each at its own rate, which falls to nothing like half a cosine."""
-    rates = {"detector": settings.learning_rate, "navigator": settings.navigator_rate}
+def _make_update(
+    params: LgmdNavigator, optimiser: optax.GradientTransformation, *, windows: int, steps: int
+) -> Callable[..., tuple[dict[str, PyTree], optax.OptState, navigator.State, Float[Array, ""]]]:
+    """Return a jitted step: (fitted parameters, optimiser's state, states, batch, step) -> (the same three, loss)."""
 
-    def steps(rate: float) -> optax.GradientTransformation:
-        return optax.chain(
-            optax.clip_by_global_norm(CLIP), optax.adam(optax.cosine_decay_schedule(rate, settings.steps), eps=SLIGHT)
-        )
+    @jax.jit
+    def update(
+        fitted: FitParams, memory: optax.OptState, states: navigator.State, batch: LgmdBatch, step: Int[Array, ""]
+    ):
+        window = jax.tree.map(lambda leaf: leaf[step % windows], batch)
+        width = SMOOTH_WIDTHS[0] * (SMOOTH_WIDTHS[1] / SMOOTH_WIDTHS[0]) ** (step / steps)
+        (error, states), grad = jax.value_and_grad(loss, has_aux=True)(fitted, params, states, window, width)
+        updates, memory = optimiser.update(grad, memory, fitted)
+        return _project(optax.apply_updates(fitted, updates)), memory, states, error
 
-    return optax.partition({name: steps(rates[name]) for name in names}, {name: name for name in names})
+    return update
 
 
-def _allowed(tuned: Any) -> dict[str, Any]:
-    """Put weights of the kernel that became negative back to nothing."""
-    if "detector" not in tuned:
-        return tuned
-    kernel = optax.projections.projection_non_negative(tuned["detector"]["kernel"])
-    return tuned | {"detector": tuned["detector"] | {"kernel": kernel}}
+def _optimiser(parts: Sequence[str], settings: LgmdGradientSettings) -> optax.GradientTransformation:
+    """Return Adam with gradient clipping for each part, at a rate of its own that decays along half a cosine."""
+    rates = {"detector": settings.learning_rate, "navigator": settings.navigator_learning_rate}
+
+    def adam(rate: float) -> optax.GradientTransformation:
+        schedule = optax.cosine_decay_schedule(rate, settings.steps)
+        return optax.chain(optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adam(schedule, eps=ADAM_EPS))
+
+    return optax.partition({name: adam(rates[name]) for name in parts}, {name: name for name in parts})
+
+
+def _project(fitted: PyTree) -> dict[str, PyTree]:
+    """Set negative weights of the kernel to zero."""
+    if "detector" not in fitted:
+        return fitted
+    kernel = optax.projections.projection_non_negative(fitted["detector"]["kernel"])
+    return fitted | {"detector": fitted["detector"] | {"kernel": kernel}}

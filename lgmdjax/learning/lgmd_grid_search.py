@@ -1,14 +1,18 @@
-"""Choose the LGMD's constants on recorded walks: T_s, W_I by what u tells of distance, T_f by what walking looks like.
+"""Choose the LGMD's constants on recorded walks: T_s and W_I by a grid search, T_f by the FF values of walking.
 
-T_s "has to be set experimentally" (paper sec. 3.3). Here the pictures of a recorded walk are drawn again, and the
-detector is run with many thresholds and weights at once. The best one is that whose left-right difference of u,
-averaged over about a gait cycle, follows the difference of nearness best: steering is a matter of which side is
-nearer.
+T_s "has to be set experimentally" (paper sec. 3.3). Here the images of recorded walks are rendered again, and the
+detector is run with many pairs of T_s and W_I at once. The best pair is the one whose left-right difference of u,
+averaged over about a gait cycle, correlates best with the left-right difference of proximity, since steering depends on
+which side is nearer.
 
-T_f then lies above all FF that walking and turning make: the gate is left to motion that is not the robot's own, such
-as being lifted. A lower one cuts turns, and of two flooded eyes the nearer first, so that the difference of the two
-tells the wrong side: while turning hard it follows nearness with r = 0.3 with the gate open, and -0.6 with T_f at the
-FF of straight walking.
+T_f is then set above every FF value of walking and turning, so that suppression only answers motion that is not the
+robot's own, such as being lifted. A lower T_f suppresses u during turns, and first on the nearer side, so that the
+difference of the two eyes points to the wrong side:
+
+| T_f                    | correlation of u with proximity in hard turns, left - right |
+| ---------------------- | ----------------------------------------------------------- |
+| infinite               | 0.3                                                         |
+| FF of straight walking | -0.6                                                        |
 
 | symbol      | name                    | unit |
 | ----------- | ----------------------- | ---- |
@@ -17,9 +21,9 @@ FF of straight walking.
 | T_f         | suppression             | grey |
 | U / n_cell  | excitation              | grey |
 | FF          | feed_forward            | grey |
-| 1/d         | nearness                | 1/m  |
+| 1/d         | proximity               | 1/m  |
 
-Source: Cizek & Faigl, eqs. 12-16 and sec. 3.3; the statistic is our own.
+Source: Cizek & Faigl, eqs. 12-16 and sec. 3.3; the correlation as a criterion is ours.
 """
 
 from collections.abc import Sequence
@@ -31,12 +35,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
-from lgmdjax.evaluation.metrics import AVERAGED
+from lgmdjax.evaluation.metrics import AVERAGING_TIME
 from lgmdjax.sensors import camera
 from lgmdjax.simulation import rerender, rollout, sharding
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
@@ -44,20 +48,20 @@ from lgmdjax.world import arena
 
 THRESHOLDS = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # candidates for T_s, grey
 INHIBITIONS = (0.1, 0.2, 0.3, 0.4)  # candidates for W_I; the paper's is 0.4
-MARGIN = 1.25  # T_f over the greatest FF of walking
+SUPPRESSION_MARGIN = 1.25  # T_f relative to the largest FF of walking
 
 
 @struct.dataclass(kw_only=True)
 class Candidates:
-    """Pairs of constants to try."""
+    """Pairs of constants to compare."""
 
     threshold: Float[Array | np.ndarray, "candidates"]  # T_s, grey
     inhibition: Float[Array | np.ndarray, "candidates"]  # W_I
 
 
 @struct.dataclass(kw_only=True)
-class Choice:
-    """The constants chosen, and how all candidates did."""
+class Selection:
+    """The selected constants, and the correlations of every candidate."""
 
     threshold: float
     inhibition: float
@@ -65,101 +69,106 @@ class Choice:
     table: list[dict[str, float]]
 
 
-def grid(thresholds: Sequence[float] = THRESHOLDS, inhibitions: Sequence[float] = INHIBITIONS) -> Candidates:
-    """Pair each threshold with each weight."""
+def candidate_grid(thresholds: Sequence[float] = THRESHOLDS, inhibitions: Sequence[float] = INHIBITIONS) -> Candidates:
+    """Combine every threshold with every weight.
+
+    >>> grid = candidate_grid([1.0, 2.0], [0.2, 0.4])
+    >>> grid.threshold.tolist(), grid.inhibition.tolist()
+    ([1.0, 2.0, 1.0, 2.0], [0.2, 0.2, 0.4, 0.4])
+    """
     pairs = np.array(list(product(inhibitions, thresholds)), dtype=float)
     return Candidates(threshold=pairs[:, 1], inhibition=pairs[:, 0])
 
 
-@partial(jax.jit, static_argnames="eyes")
-def survey(
-    params: lgmd.Params, eyes: camera.Params, arenas: arena.Arena, record: Record, candidates: Candidates
+@partial(jax.jit, static_argnames="camera_params")
+def evaluate(
+    params: lgmd.Params, camera_params: camera.Params, arenas: arena.Arena, record: Record, candidates: Candidates
 ) -> tuple[Float[Array, "robots frames 2 candidates"], Float[Array, "robots frames 2"]]:
-    """Draw what recorded walks saw once more, and return u for every candidate, the gate open, and FF, of both eyes.
+    """Render recorded walks again; return u of every candidate without suppression, and FF, of both eyes.
 
-    The eyes open on the first picture, and anew wherever the robot was put down.
+    The detectors are initialised with the first image, and again after every reset of the robot.
     """
 
-    def see(candidate: Candidates, state: lgmd.State, picture: Array) -> tuple[lgmd.State, Array, Array]:
-        chosen = {"threshold": candidate.threshold, "inhibition": candidate.inhibition, "suppression": jnp.inf}
-        state, response = lgmd.step(replace(params, **chosen), state, picture)
+    def respond(candidate: Candidates, state: lgmd.State, image: Array) -> tuple[lgmd.State, Array, Array]:
+        constants = {"threshold": candidate.threshold, "inhibition": candidate.inhibition, "suppression": jnp.inf}
+        state, response = lgmd.step(replace(params, **constants), state, image)
         return state, response.u, response.feed_forward
 
-    # What no candidate changes, the next state and FF, is evaluated once.
-    see_all = jax.vmap(see, in_axes=(0, None, None), out_axes=(None, 0, None))
+    # The next state and FF are the same for all candidates, and are computed once.
+    respond_all = jax.vmap(respond, in_axes=(0, None, None), out_axes=(None, 0, None))
 
-    open_eyes = jax.vmap(partial(lgmd.init, params))
+    init_both = jax.vmap(partial(lgmd.init, params))
 
     def step(room: arena.Arena, state: lgmd.State, row: tuple[Array, ...]):
-        fresh, *pose = row
-        pictures = rerender.frame(eyes, room, *pose)
-        opened = jax.tree.map(partial(jnp.where, fresh), open_eyes(pictures), state)
-        state, u, FF = jax.vmap(see_all, in_axes=(None, 0, 0))(candidates, opened, pictures)
+        is_first, *pose = row
+        images = rerender.render_pose(camera_params, room, *pose)
+        state = jax.tree.map(partial(jnp.where, is_first), init_both(images), state)
+        state, u, FF = jax.vmap(respond_all, in_axes=(None, 0, 0))(candidates, state, images)
         return state, (u, FF)
 
     def work(rooms: arena.Arena, rows: tuple[Array, ...]):
-        shut = jax.vmap(open_eyes)(jnp.zeros((len(rows[0]), *camera.shape(eyes))))
-        return rollout.march(step, rooms, shut, rows)[1]
+        black = jax.vmap(init_both)(jnp.zeros((len(rows[0]), *camera.image_shape(camera_params))))
+        return rollout.scan_batch(step, rooms, black, rows)[1]
 
-    fresh = jnp.asarray(record.fresh).at[:, 0].set(True)
+    is_first = jnp.asarray(record.is_first).at[:, 0].set(True)
     poses = (record.time, record.position, record.quaternion)
-    return sharding.deal(work, arenas, (fresh, *map(jnp.asarray, poses)))
+    return sharding.shard_robots(work, arenas, (is_first, *map(jnp.asarray, poses)))
 
 
-def choose(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: Candidates) -> Choice:
-    """Choose T_s, W_I and T_f from a survey of recorded walks.
+def select(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: Candidates) -> Selection:
+    """Select T_s, W_I and T_f from the responses to recorded walks.
 
     Args:
         record: the walks, axes (robot, frame).
         u: of every candidate, (robots, frames, 2, candidates).
         feed_forward: FF, (robots, frames, 2) [grey].
-        candidates: what was tried.
+        candidates: the pairs of constants.
 
-    Raises InputError when there is too little sound walking to tell.
+    Raises InputError if there are less than 10 s of steady walking.
     """
-    sound = _sound(record)
-    if sound.sum() < 10 * FRAME_RATE:
+    steady = _is_steady_walking(record)
+    if steady.sum() < 10 * FRAME_RATE:
         raise InputError(
-            f"calibration: expected 10 s or more of walking, got {sound.sum() / FRAME_RATE:.1f} s; "
+            f"calibration: expected 10 s or more of walking, got {steady.sum() / FRAME_RATE:.1f} s; "
             "record longer walks, or more robots"
         )
-    nearness = 1 / np.asarray(record.distances)
-    averaged = ndimage.uniform_filter1d(np.asarray(u), round(AVERAGED * FRAME_RATE), axis=1)[sound]
+    proximity = 1 / np.asarray(record.distances)
+    averaged = ndimage.uniform_filter1d(np.asarray(u), round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
     pairs = zip(candidates.threshold.tolist(), candidates.inhibition.tolist(), strict=True)
     table = [
-        {"threshold": T_s, "inhibition": W_I, **_agreement(averaged[..., k], nearness[sound])}
+        {"threshold": T_s, "inhibition": W_I, **_correlations(averaged[..., k], proximity[steady])}
         for k, (T_s, W_I) in enumerate(pairs)
     ]
     best = max(table, key=lambda row: row["score"])
-    suppression = MARGIN * float(np.max(np.asarray(feed_forward)[sound]))
-    return Choice(threshold=best["threshold"], inhibition=best["inhibition"], suppression=suppression, table=table)
+    suppression = SUPPRESSION_MARGIN * float(np.max(np.asarray(feed_forward)[steady]))
+    return Selection(threshold=best["threshold"], inhibition=best["inhibition"], suppression=suppression, table=table)
 
 
-def follow(record: Record) -> dict[str, float]:
-    """Correlate what the eyes of recorded walks said with nearness, as `choose` does for its candidates."""
-    sound = _sound(record)
-    averaged = ndimage.uniform_filter1d(np.asarray(record.u), round(AVERAGED * FRAME_RATE), axis=1)[sound]
-    if not sound.any():  # as of a robot that falls at once
+def correlate_with_proximity(record: Record) -> dict[str, float]:
+    """Return the correlations of the recorded u with proximity that `select` compares candidates by."""
+    steady = _is_steady_walking(record)
+    averaged = ndimage.uniform_filter1d(np.asarray(record.u), round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
+    if not steady.any():  # as of a robot that falls at once
         return dict.fromkeys(("score", "left", "right"), 0.0)
-    return _agreement(averaged, 1 / np.asarray(record.distances)[sound])
+    return _correlations(averaged, 1 / np.asarray(record.distances)[steady])
 
 
-def _sound(record: Record) -> np.ndarray:
-    """Tell which frames are walking that has lasted long enough for the average to be of nothing else."""
-    sound = np.asarray(record.ok) & ~np.asarray(record.contact) & ~np.asarray(record.fresh)
-    window = round(AVERAGED * FRAME_RATE)
-    # The average is centred: half a window on either side would do, and as much again lets the robot find its stride.
-    return ndimage.minimum_filter1d(sound.astype(np.uint8), 2 * window + 1, axis=1, mode="constant").astype(bool)
+def _is_steady_walking(record: Record) -> Bool[np.ndarray, "robots frames"]:
+    """Flag frames whose averaging window, and half a window on either side of it, contain nothing but walking."""
+    walking = np.asarray(record.ok) & ~np.asarray(record.contact) & ~np.asarray(record.is_first)
+    window = round(AVERAGING_TIME * FRAME_RATE)
+    # The average is centred and needs half a window on either side; the other half lets the gait become steady.
+    return ndimage.minimum_filter1d(walking.astype(np.uint8), 2 * window + 1, axis=1, mode="constant").astype(bool)
 
 
-def _agreement(u: Float[np.ndarray, "frames 2"], nearness: Float[np.ndarray, "frames 2"]) -> dict[str, float]:
-    """Correlate u with 1/d on either side, and the differences of the sides, which is the score."""
+def _correlations(u: Float[np.ndarray, "frames 2"], proximity: Float[np.ndarray, "frames 2"]) -> dict[str, float]:
+    """Correlate u with 1/d on each side, and the left-right differences of both, which is the score."""
 
     def correlation(a: np.ndarray, b: np.ndarray) -> float:
         return float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0 and np.ptp(b) > 0 else 0.0
 
     return {
-        "score": correlation(u[:, 0] - u[:, 1], nearness[:, 0] - nearness[:, 1]),
-        "left": correlation(u[:, 0], nearness[:, 0]),
-        "right": correlation(u[:, 1], nearness[:, 1]),
+        "score": correlation(u[:, 0] - u[:, 1], proximity[:, 0] - proximity[:, 1]),
+        "left": correlation(u[:, 0], proximity[:, 0]),
+        "right": correlation(u[:, 1], proximity[:, 1]),
     }

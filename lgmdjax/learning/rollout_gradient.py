@@ -1,184 +1,219 @@
-"""The imitation loss of robots that walk: how far their commands are from the rule's, differentiated through time.
+"""The imitation loss of a rollout, and its gradient through time by all parameters of the controller.
 
-Robots walk in their rooms, the navigator at the wheel, and the rule labels every frame. The loss of a window of
-frames is
+Robots walk in their rooms under the navigator's control, and the teacher's rule labels every frame. The loss of a
+window of frames is
 
-    L = mean over its frames and both sides of |v - v*|^2,
+    L = mean over its frames and both sides of |v - v*|^2.
 
-of which reverse mode takes the derivative by everything between the eyes and the servos (`controller.Params`). What it
-passes on the way is chosen by `through` (`simulation.step`):
+Reverse mode differentiates it by everything between the cameras and the servos (`controller.Params`). `grad_path`
+chooses what the derivative passes through (`closed_loop.step`):
 
-| through    | the derivative passes                                        | held as they were in the walk |
-| ---------- | ------------------------------------------------------------ | ----------------------------- |
-| controller | navigator and what it remembers, its own commands among that  | u, v*, the body               |
-| nerves     | and CPG, shaping, servos, body, laser, rule                  | u                             |
-| everything | and cameras and LGMD: it is the derivative of the loss        | nothing                       |
+| grad_path  | the derivative passes through                                   | held constant   |
+| ---------- | --------------------------------------------------------------- | --------------- |
+| controller | the navigator, its recurrent state and its own past commands    | u, v*, the body |
+| body       | also CPG, shaping network, servos, body, laser, teacher's rule  | u               |
+| everything | also cameras and LGMD: the full derivative of the loss          | nothing         |
 
-Unlike recorded walks, which can only tell what to say to a u, the loss of a walk knows what a command, a stride or a
-threshold does to all that follows.
+Recorded walks only show which command suits a given u. The loss of a rollout also contains what a command, a step or a
+threshold changes in all frames that follow.
 
-A window ends where its states are handed on: the next begins in them, without their derivative.
+Between windows the states are passed on without their derivative.
 
-Parameters differ by orders of magnitude, and their slopes by more. A gradient is measured in shares of their sizes,
-which the caller names (`lgmdjax.learning.finetuning`).
+Parameters differ by orders of magnitude, and their derivatives by more. The gradient is therefore expressed in units
+of `param_scales` (`lgmdjax.learning.finetuning.param_scales`).
 
-| symbol | name            | unit                 | equation |
-| ------ | --------------- | -------------------- | -------- |
-| v      | record.velocity | nominal              | 17       |
-| v*     | record.label    | nominal              | 22       |
-| L      | loss            | nominal^2            | sec. 5.1 |
-| -      | slope           | nominal^2 by a share | -        |
+| symbol | name            | unit                      | equation |
+| ------ | --------------- | ------------------------- | -------- |
+| v      | record.velocity | nominal                   | 17       |
+| v*     | record.label    | nominal                   | 22       |
+| L      | loss            | nominal^2                 | sec. 5.1 |
+| dL/dp  | grad            | nominal^2 per param_scale | -        |
 
-Gradient: a robot that is set back starts anew, and what it did before does not count for what comes after. One that
-fell counts no longer. Thresholds that are steps have none (`lgmd.Params.smooth`).
+Gradient: a reset cuts it, so that no frame depends on what came before the reset. A robot that fell adds nothing.
+Hard thresholds have none (`lgmd.Params.smooth`).
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float
-from mujoco import mjx
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lgmdjax.control import controller, policies
 from lgmdjax.detectors import lgmd
-from lgmdjax.runtime.export_cache import Kept
+from lgmdjax.runtime.export_cache import cached_jit
+from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import closed_loop, rollout, sharding
-from lgmdjax.simulation.closed_loop import Params, Record, Room, State, Through
+from lgmdjax.simulation.closed_loop import GradPath, Params, Record, Room, State
 
-WIDTH = 0.3  # of a smooth threshold, as a share of it
+SMOOTH_WIDTH = 0.3  # of a smooth threshold, relative to the threshold
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """A window, and how its derivative is taken."""
+    """Length of a window, and how its derivative is taken."""
 
     frames: int = 30
-    through: Through = "everything"
-    remat: bool = True  # walk each frame again on the way back: its inside need not be kept; physics steps are anyway
-    clip: float = math.inf  # largest norm of one robot's gradient, as a multiple of the crowd's middle one
-    draw: bool = True  # what the eyes see; else they stay shut
+    grad_path: GradPath = "everything"
+    remat: bool = True  # recompute each frame in the backward pass, to save memory; physics steps always are
+    clip: float = math.inf  # largest norm of one robot's gradient, relative to the median of all robots
+    render: bool = True  # the camera images; without them the LGMDs see black
 
 
 @struct.dataclass(kw_only=True)
 class Gradient:
-    """What a crowd's window gives."""
+    """Loss and gradient of a window, over a batch of robots. Robots with `nonfinite` are left out of the means."""
 
-    loss: Float[Array, ""]  # mean over the robots that count
-    slope: controller.Params  # mean of their gradients, each cut to the largest norm, by shares of the sizes
-    norms: Float[Array, " robots"]  # before that
-    noise: Float[Array, ""]  # root of the mean's variance, as its robots differ: its norm by chance alone
-    lost: Bool[Array, " robots"]  # whose loss or gradient is not finite: they do not count
+    loss: Float[Array, ""]  # mean
+    grad: controller.Params  # mean of the clipped gradients, in units of param_scales
+    norms: Float[Array, " robots"]  # of each robot's gradient, before clipping
+    standard_error: Float[Array, ""]  # of the mean gradient; the norm expected by chance if the true gradient is zero
+    nonfinite: Bool[Array, " robots"]  # robots whose loss or gradient is not finite
 
 
 def losses(
-    nerves: controller.Params, params: Params, model: mjx.Model, rooms: Room, states: State, settings: Settings
+    controller_params: controller.Params,
+    params: Params,
+    model: mjx.Model,
+    rooms: Room,
+    states: State,
+    *,
+    settings: Settings,
 ) -> tuple[Float[Array, " robots"], tuple[State, Record]]:
-    """Walk a crowd for a window; give each robot's loss, the states to go on from, and what the window left behind.
+    """Roll out a batch of robots for a window; return each robot's loss, and (states after the window, record).
 
     Args:
-        nerves: each robot's own, of which the derivative is asked, in place of those in `params`; the driver is a
-            navigator. states: as `simulation.init` or the last window left them.
+        controller_params: one set per robot, to differentiate by; they replace those in `params`, and their policy is
+            a navigator.
+        params: the robot.
+        model: the body in MJX.
+        rooms: one per robot.
+        states: from `closed_loop.init`, or as the last window left them.
+        settings: of the window.
     """
 
-    def frame(place: tuple[controller.Params, Room], state: State, _: None) -> tuple[State, Record]:
-        own, room = replace(params, controller=place[0]), place[1]
-        return closed_loop.step(own, model, room, state, policies.LEARNED, settings.draw, settings.through)
+    def frame(inputs: tuple[controller.Params, Room], state: State, _: None) -> tuple[State, Record]:
+        own, room = replace(params, controller=inputs[0]), inputs[1]
+        return closed_loop.step(
+            own, model, room, state, policies.LEARNED, render=settings.render, grad_path=settings.grad_path
+        )
 
-    # What is walked again is in a loop, where XLA cannot take it for the same as the first time.
-    walked = jax.checkpoint(frame, prevent_cse=False) if settings.remat else frame
-    states, record = rollout.march(walked, (nerves, rooms), states, length=settings.frames)
+    # The recomputed frame is inside a loop, where XLA cannot merge it with the first one.
+    step = jax.checkpoint(frame, prevent_cse=False) if settings.remat else frame
+    states, record = rollout.scan_batch(step, (controller_params, rooms), states, length=settings.frames)
     error = jnp.mean((record.velocity - record.label) ** 2, axis=-1)
     return jnp.mean(jnp.where(record.ok, error, 0.0), axis=-1), (states, record)
 
 
 def loss(
-    nerves: controller.Params, params: Params, model: mjx.Model, room: Room, state: State, settings: Settings
+    controller_params: controller.Params,
+    params: Params,
+    model: mjx.Model,
+    room: Room,
+    state: State,
+    *,
+    settings: Settings,
 ) -> tuple[Float[Array, ""], tuple[State, Record]]:
-    """Walk one robot, as `losses` does a crowd."""
-    nerves, room, state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (nerves, room, state))
-    found, rest = losses(nerves, params, model, room, state, settings)
-    return found[0], jax.tree.map(lambda leaf: leaf[0], rest)
+    """Roll out one robot, as `losses` does a batch."""
+    add_axis = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf)[None])
+    values, aux = losses(add_axis(controller_params), params, model, add_axis(room), add_axis(state), settings=settings)
+    return values[0], jax.tree.map(lambda leaf: leaf[0], aux)
 
 
-@partial(Kept, donated=("states",))
+@partial(cached_jit, donate_argnames=("states",))
 def gradient(
-    params: Params, model: mjx.Model, rooms: Room, states: State, sizes: controller.Params, *, settings: Settings
+    params: Params, model: mjx.Model, rooms: Room, states: State, param_scales: controller.Params, *, settings: Settings
 ) -> tuple[Gradient, State, Record]:
-    """Walk a crowd for a window, each robot in its own room, and take the gradient of its mean loss.
-
-    The crowd is dealt out to all devices. A robot whose loss or gradient is not finite is left out of the means,
-    and flagged.
+    """Roll out a batch of robots for a window, and take the gradient of their mean loss, on all devices.
 
     Args:
-        states: from `rollout.start`, or as the last window left them; they are used up.
-        sizes: of the nerves' parameters, in which the gradient is measured; zero for what it leaves out.
+        params: the robot; its policy is a navigator.
+        model: the body in MJX.
+        rooms: one per robot.
+        states: from `rollout.reset_batch`, or as the last window left them; their buffers are donated.
+        param_scales: units of the gradient, one per parameter; zero gives a zero gradient.
+        settings: of the window.
+
+    Returns:
+        The gradient, the states after the window, and the record.
     """
 
-    def share(rooms: Room, states: State) -> tuple[Any, Any]:
-        nerves = each_its_own(params.controller, rooms.starts.shape[0])
-        return slopes(lambda nerves: losses(nerves, params, model, rooms, states, settings), nerves)
+    def work(rooms: Room, states: State) -> PyTree:
+        copies = broadcast_params(params.controller, rooms.starts.shape[0])
+        return per_robot_grad(lambda own: losses(own, params, model, rooms, states, settings=settings), copies)
 
-    (costs, (states, record)), each = sharding.deal(share, rooms, states)
-    each = jax.tree.map(jnp.multiply, each, sizes)
-    norms: Array = jax.vmap(optax.tree.norm)(each)
-    lost = ~(jnp.isfinite(costs) & jnp.isfinite(norms))
-    count = jnp.maximum(jnp.sum(~lost), 1)
-    scale = jnp.where(lost, 0.0, _cut(norms, lost, settings.clip)) / count
+    (values, (states, record)), grads = sharding.shard_robots(work, rooms, states)
+    return _average(values, jax.tree.map(jnp.multiply, grads, param_scales), settings.clip), states, record
+
+
+def per_robot_grad(
+    losses: Callable[[controller.Params], tuple[Float[Array, " robots"], PyTree]], controller_params: controller.Params
+) -> tuple[tuple[Float[Array, " robots"], PyTree], controller.Params]:
+    """Return (losses, auxiliary output), and the gradient of each robot's loss by its own parameters.
+
+    Robots do not interact, so one backward pass of the sum of all losses gives all gradients.
+    """
+
+    def total(controller_params: controller.Params) -> tuple[Float[Array, ""], PyTree]:
+        values, aux = losses(controller_params)
+        return jnp.sum(values), (values, aux)
+
+    grads, found = jax.grad(total, has_aux=True)(controller_params)
+    return found, grads
+
+
+def broadcast_params(controller_params: controller.Params, robots: int) -> controller.Params:
+    """Return a copy of the parameters for each robot of a batch."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *jnp.shape(leaf))), controller_params)
+
+
+def learned_only(params: Params) -> Params:
+    """Return a robot with the navigator as its only policy, from one that switches between all five."""
+    learned = params.controller.policy.policies[policies.POLICIES.index(policies.LEARNED)]
+    return replace(params, controller=replace(params.controller, policy=learned))
+
+
+def smooth_thresholds(params: Params) -> Params:
+    """Return a robot whose LGMDs have differentiable thresholds of relative width `SMOOTH_WIDTH`."""
+    smoothed = lgmd.with_smooth_thresholds(params.controller.lgmd, SMOOTH_WIDTH)
+    return replace(params, controller=replace(params.controller, lgmd=smoothed))
+
+
+def _average(values: Float[Array, " robots"], grads: controller.Params, clip: float) -> Gradient:
+    """Average losses and clipped gradients over the robots for which both are finite."""
+    norms: Array = jax.vmap(optax.tree.norm)(grads)
+    nonfinite = ~(jnp.isfinite(values) & jnp.isfinite(norms))
+    count = jnp.maximum(jnp.sum(~nonfinite), 1)
+    weights = jnp.where(nonfinite, 0.0, _clip_factors(norms, nonfinite, clip)) / count
 
     def mean(leaf: Float[Array, "robots *shape"]) -> Float[Array, "*shape"]:
-        sound = jnp.where(lost.reshape(-1, *[1] * (leaf.ndim - 1)), 0.0, leaf)
-        return jnp.tensordot(scale.astype(leaf.dtype), sound, axes=1)
+        finite = jnp.where(nonfinite.reshape(-1, *[1] * (leaf.ndim - 1)), 0.0, leaf)
+        return jnp.tensordot(weights.astype(leaf.dtype), finite, axes=1)
 
-    slope = jax.tree.map(mean, each)
-    # The variance of a mean: what its robots' squares have more than its own.
-    squares = count * jnp.sum((scale * jnp.where(lost, 0.0, norms)) ** 2)
-    noise = jnp.sqrt(jnp.maximum(squares - optax.tree.norm(slope, squared=True), 0.0) / jnp.maximum(count - 1, 1))
-    found = Gradient(loss=jnp.sum(costs, where=~lost) / count, slope=slope, norms=norms, noise=noise, lost=lost)
-    return found, states, record
-
-
-def slopes(
-    of: Callable[[controller.Params], tuple[Float[Array, " robots"], Any]], nerves: controller.Params
-) -> tuple[tuple[Float[Array, " robots"], Any], controller.Params]:
-    """Give what a crowd's losses and the rest are, and the gradient of each robot's loss by its own nerves.
-
-    Robots are apart: it is that of the sum.
-    """
-
-    def total(nerves: controller.Params) -> tuple[Float[Array, ""], Any]:
-        found, rest = of(nerves)
-        return jnp.sum(found), (found, rest)
-
-    each, found = jax.grad(total, has_aux=True)(nerves)
-    return found, each
+    grad = jax.tree.map(mean, grads)
+    # The mean's variance is the mean of the squared norms, minus the mean's squared norm, over n - 1.
+    squares = count * jnp.sum((weights * jnp.where(nonfinite, 0.0, norms)) ** 2)
+    excess = jnp.maximum(squares - optax.tree.norm(grad, squared=True), 0.0)
+    standard_error = jnp.sqrt(excess / jnp.maximum(count - 1, 1))
+    return Gradient(
+        loss=jnp.sum(values, where=~nonfinite) / count,
+        grad=grad,
+        norms=norms,
+        standard_error=standard_error,
+        nonfinite=nonfinite,
+    )
 
 
-def each_its_own(nerves: controller.Params, robots: int) -> controller.Params:
-    """Copy nerves for each robot of a crowd."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *jnp.shape(leaf))), nerves)
-
-
-def _cut(norms: Float[Array, " robots"], lost: Bool[Array, " robots"], clip: float) -> Float[Array, " robots"]:
-    """Scale gradients down that are longer than a multiple of the middle one; those that fell have none."""
+def _clip_factors(
+    norms: Float[Array, " robots"], nonfinite: Bool[Array, " robots"], clip: float
+) -> Float[Array, " robots"]:
+    """Return factors that shorten gradients to `clip` times the median norm of the robots that have not fallen."""
     if math.isinf(clip):
         return jnp.ones_like(norms)
-    middle = jnp.nan_to_num(jnp.nanmedian(jnp.where(lost | (norms == 0), jnp.nan, norms)))
-    return jnp.minimum(1.0, clip * middle / jnp.maximum(norms, 1e-30))
-
-
-def alone(params: Params) -> Params:
-    """Leave the navigator alone at the wheel of a robot that all five drivers are aboard of."""
-    driver = params.controller.driver.drivers[policies.ALL.index(policies.LEARNED)]
-    return replace(params, controller=replace(params.controller, driver=driver))
-
-
-def smooth(params: Params) -> Params:
-    """Give a robot's detectors steps that have a slope, `WIDTH` wide."""
-    return replace(params, controller=replace(params.controller, lgmd=lgmd.smoothed(params.controller.lgmd, WIDTH)))
+    median = jnp.nan_to_num(jnp.nanmedian(jnp.where(nonfinite | (norms == 0), jnp.nan, norms)))
+    return jnp.minimum(1.0, clip * median / jnp.maximum(norms, 1e-30))

@@ -1,4 +1,4 @@
-"""Recorded walks as arrays to learn from: split by room or in halves, laid end to end, and cut into streams."""
+"""Batches of training sequences from recorded walks, and splits of walks into training and held-out parts."""
 
 from collections.abc import Sequence
 
@@ -12,63 +12,69 @@ from lgmdjax.simulation.episodes import Walk
 
 
 @struct.dataclass(kw_only=True)
-class Tape:
-    """Frames to learn from, by window (unless it is one of them), frame in the window, and stream."""
+class SequenceBatch:
+    """Training data as parallel streams of frames, cut into windows; one window has no leading axis."""
 
     u: Float[Array, "*windows frames streams 2"]
     label: Float[Array, "*windows frames streams 2"]
-    last: Float[Array, "*windows frames streams 2"]  # velocity of the frame before
-    fresh: Bool[Array, "*windows frames streams"]  # nothing is remembered from before this frame
-    counts: Float[Array, "*windows frames streams"]  # 1, or 0 where the tape is padded
+    previous_velocity: Float[Array, "*windows frames streams 2"]  # command of the previous frame
+    is_first: Bool[Array, "*windows frames streams"]  # the recurrent state is reset before this frame
+    mask: Float[Array, "*windows frames streams"]  # 1, or 0 in padding
 
 
-def halve(walks: Sequence[Walk]) -> tuple[list[Walk], list[Walk]]:
-    """Split every stretch in its middle, as the paper splits its data: first halves train, others test."""
+def split_halves(walks: Sequence[Walk]) -> tuple[list[Walk], list[Walk]]:
+    """Split every segment in its middle, as the paper does: first halves for training, second halves for testing."""
     return [w[: len(w) // 2] for w in walks], [w[len(w) // 2 :] for w in walks]
 
 
-def split_by_room(walks: Sequence[Walk], unseen: float, seed: int) -> tuple[list[Walk], list[Walk]]:
-    """Keep whole rooms back: walks in the others, and in a fraction `unseen` of rooms, drawn by seed."""
+def split_by_room(walks: Sequence[Walk], held_out: float, seed: int) -> tuple[list[Walk], list[Walk]]:
+    """Split walks by room; return those in the other rooms, and those in a random fraction `held_out` of all rooms."""
     rooms = sorted({walk.room for walk in walks})
-    if not 0 < unseen < 1 or len(rooms) < 2:
+    if not 0 < held_out < 1 or len(rooms) < 2:
         raise InputError(
-            f"training: expected a fraction in 0..1 of two rooms or more, got {unseen} of {len(rooms)}; "
+            f"training: expected a fraction in 0..1 of two rooms or more, got {held_out} of {len(rooms)}; "
             "collect more rooms"
         )
-    count = min(max(1, round(unseen * len(rooms))), len(rooms) - 1)
-    kept = set(np.random.default_rng(seed).permutation(rooms)[:count].tolist())
-    return [w for w in walks if w.room not in kept], [w for w in walks if w.room in kept]
+    count = min(max(1, round(held_out * len(rooms))), len(rooms) - 1)
+    chosen = set(np.random.default_rng(seed).permutation(rooms)[:count].tolist())
+    return [w for w in walks if w.room not in chosen], [w for w in walks if w.room in chosen]
 
 
-def lay(walks: Sequence[Walk], first: Float[np.ndarray, "2"], *, streams: int, window: int, mirrored: bool) -> Tape:
-    """Lay walks end to end and cut them into streams of whole windows.
+def pack(
+    walks: Sequence[Walk], initial_velocity: Float[np.ndarray, "2"], *, streams: int, window: int, mirrored: bool
+) -> SequenceBatch:
+    """Concatenate walks and cut them into parallel streams of equal windows.
 
     Args:
-        walks: stretches of walking.
-        first: velocity before the first frame of each.
-        streams: walked side by side.
-        window: about as many frames; a little more or less, so that little is padded.
-        mirrored: add every stream with left and right exchanged.
+        walks: segments of walks.
+        initial_velocity: previous velocity at the first frame of each segment.
+        streams: number of parallel streams.
+        window: frames in a window; the actual number differs a little, to keep the padding short.
+        mirrored: append each stream's mirror image (left and right exchanged).
     """
     u, label = (np.concatenate([getattr(walk, name) for walk in walks]) for name in ("u", "label"))
-    last = np.concatenate([np.concatenate([first[None], walk.velocity[:-1]]) for walk in walks])
-    fresh = np.concatenate([np.arange(len(walk)) == 0 for walk in walks])
+    previous = np.concatenate([np.concatenate([initial_velocity[None], walk.velocity[:-1]]) for walk in walks])
+    is_first = np.concatenate([np.arange(len(walk)) == 0 for walk in walks])
 
-    def both(values: np.ndarray) -> np.ndarray:
-        values = cut(values, streams=streams, window=window)
+    def windows(values: np.ndarray) -> np.ndarray:
+        values = to_streams(values, streams=streams, window=window)
         if not mirrored:
             return values
         swapped = values[..., ::-1] if values.ndim == 4 else values
         return np.concatenate([values, swapped], axis=2)
 
-    counts, fresh = np.ones(len(fresh)), both(fresh)
-    fresh[0, 0] = True
-    u, label, last, counts = (jnp.asarray(both(x), dtype=float) for x in (u, label, last, counts))
-    return Tape(u=u, label=label, last=last, fresh=jnp.asarray(fresh), counts=counts)
+    mask, is_first = np.ones(len(is_first)), windows(is_first)
+    is_first[0, 0] = True
+    u, label, previous, mask = (jnp.asarray(windows(x), dtype=float) for x in (u, label, previous, mask))
+    return SequenceBatch(u=u, label=label, previous_velocity=previous, is_first=jnp.asarray(is_first), mask=mask)
 
 
-def cut(values: Shaped[np.ndarray, "all *shape"], *, streams: int, window: int) -> np.ndarray:
-    """Cut a series into streams of windows, axes (window, frame, stream, ...), as `lay` does, filled up with zeros."""
+def to_streams(values: Shaped[np.ndarray, "frames *shape"], *, streams: int, window: int) -> np.ndarray:
+    """Cut a series into windows of parallel streams, axes (window, frame, stream, ...), padded with zeros at its end.
+
+    >>> to_streams(np.arange(1, 8), streams=2, window=2).tolist()
+    [[[1, 5], [2, 6]], [[3, 7], [4, 0]]]
+    """
     frames = len(values)
     windows = max(1, round(frames / (streams * window)))
     length = -(-frames // (streams * windows))

@@ -1,4 +1,4 @@
-"""Settings of stage train."""
+"""Settings of the stage `train` and of the study `lgmd_gradient`. Imports no JAX."""
 
 from dataclasses import dataclass
 
@@ -7,30 +7,30 @@ from lgmdjax.sensors.settings import CameraSettings
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings:
-    """The navigator and those it is compared with, after some rounds of walking itself and being corrected."""
+    """Training of the navigator and its variants: rounds of DAgger, then a final fit of every variant."""
 
-    eyes: CameraSettings
-    epochs: int
-    rounds: int
-    round_epochs: int
-    robots: int
-    round_seconds: float  # of each robot
-    halves_epochs: int = 80  # of the fit to the teacher's walks in halves, the paper's
-    variants: tuple[str, ...] = ("lstm", "lstm-efference", "feed-forward", "mean")
-    cautions: tuple[float, ...] = ()  # to choose from by walking as in a round; none: `training.CAUTION`
+    eyes: CameraSettings  # camera of the robot
+    epochs: int  # number of epochs of the final fits
+    dagger_rounds: int  # number of rounds of DAgger
+    round_epochs: int  # number of epochs of the fit in each round
+    robots: int  # number of robots in each round
+    round_seconds: float  # simulated time of each robot in a round [s]
+    split_half_epochs: int = 80  # number of epochs of the fit to the teacher's walks split in halves, as in the paper
+    variants: tuple[str, ...] = ("lstm", "lstm-efference", "feed-forward", "mean")  # networks to fit and compare
+    turn_gains: tuple[float, ...] = ()  # turn gains to compare by walking; none: behaviour_cloning.TURN_GAIN
 
 
 @dataclass(frozen=True, kw_only=True)
 class LgmdGradientSettings:
-    """The LGMD fitted on recorded walks, with its navigator and without, from `seeds` starts."""
+    """Fit of the LGMD to recorded walks by gradient, with and without its navigator."""
 
-    minutes: float  # of walking, drawn again
-    seconds: float  # of each walk: the shorter, the more rooms
-    epochs: int  # of the navigator's own fit, before
-    steps: int  # of the optimiser
-    every: int  # steps from one look at the walks kept back to the next
-    window: int  # frames through which the error goes back
-    streams: int
-    learning_rate: float  # of the detector's constants as shares; falls to nothing like half a cosine
-    navigator_rate: float  # of the navigator's weights, likewise
-    seeds: int
+    minutes: float  # recorded walking to fit to and evaluate on, in all [min]
+    seconds: float  # duration of each walk [s]; shorter walks mean more rooms
+    epochs: int  # number of epochs of the navigator's own fit, before the LGMD's
+    steps: int  # number of optimiser steps
+    eval_every: int  # number of steps between two evaluations on held-out walks
+    window: int  # number of frames of back-propagation through time
+    streams: int  # number of parallel sequences
+    learning_rate: float  # initial learning rate of the detector's constants; decays to zero along half a cosine
+    navigator_learning_rate: float  # initial learning rate of the navigator's weights; decays likewise
+    seeds: int  # number of repeats, each with its own seed

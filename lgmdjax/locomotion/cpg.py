@@ -1,8 +1,8 @@
-"""Central pattern generator: six Matsuoka oscillators, one a leg, that fall into the tripod rhythm.
+"""Central pattern generator (CPG): six Matsuoka oscillators, one per leg, that converge to the tripod rhythm.
 
-Each unit is a pair of neurons, extensor and flexor, that tire (adaptation) and silence each other; units
-silence each other's like neurons through the matrix W. The network has no unit of time of its own, so it is
-integrated in scaled time: one cycle takes `cycle_time` seconds.
+Each unit is a pair of neurons, extensor and flexor, which adapt and inhibit each other. Units inhibit each other's
+neurons of the same kind through the matrix W. The network's time has no physical unit, so it is integrated in scaled
+time: one cycle takes `cycle_time` seconds.
 
 | symbol     | name                       | unit      | equation |
 | ---------- | -------------------------- | --------- | -------- |
@@ -17,14 +17,14 @@ integrated in scaled time: one cycle takes `cycle_time` seconds.
 | CPG_i      | rhythm[i, 0]               | 1         | 6        |
 | -          | rhythm[i, 1] = v_e - v_f   | 1         | -        |
 
-Source: Cizek & Faigl, sec. 3.2; Matsuoka 1987. Three things printed there cannot hold and are corrected: the
-sign of w_fe (`printed_sign`), the undefined r of eqs. 1 and 3 (read as the unit's other neuron), and W, whose
-two weights are swapped (`coupling`, where `within_tripod=0.40, across=0.04` is the printed one).
+Source: Cizek & Faigl, sec. 3.2; Matsuoka 1987. Three printed details are wrong and are corrected: the sign of w_fe
+(`printed_sign`), the undefined r of eqs. 1 and 3 (taken as the unit's other neuron), and W, whose two weights are
+swapped (`coupling`; the printed form is `within_tripod=0.40, across=0.04`).
 
-Legs in order: left front, left middle, left rear, right rear, right middle, right front; the tripods are {0,
-2, 4} and {1, 3, 5}, the even and the odd.
+Leg order: left front, left middle, left rear, right rear, right middle, right front. The tripods are the even legs
+{0, 2, 4} and the odd legs {1, 3, 5}.
 
-Gradient: exact almost everywhere; where an activation is exactly zero the rectifier's is taken as zero.
+Gradient: exact almost everywhere; where an activation is exactly zero, that of the rectifier is taken as zero.
 """
 
 import math
@@ -40,22 +40,28 @@ from lgmdjax.errors import InputError
 LEGS = 6
 EXTENSOR, FLEXOR = 0, 1
 CYCLE_TIME = 0.8  # s: 24 camera frames
-NATURAL_PERIOD = 6.6941175  # time units a cycle, for the default parameters
+NATURAL_PERIOD = 6.6941175  # time units per cycle, for the default parameters
 
-# A point of the limit cycle of the default parameters, where the activations of a pair are equal and the even
-# tripod's extensors are rising: (extensor, flexor) of an even leg; an odd leg is half a cycle away, where
-# they swap.
-SETTLED_ACTIVATION = (0.069216745, 0.069216745)
-SETTLED_ADAPTATION = (0.019520150, 0.116315497)
+# (extensor, flexor) of an even leg at a point of the limit cycle of the default parameters. There the two activations
+# are equal, and the extensors of the even tripod are rising. An odd leg is half a cycle away, where the pair swaps.
+LIMIT_CYCLE_ACTIVATION = (0.069216745, 0.069216745)
+LIMIT_CYCLE_ADAPTATION = (0.019520150, 0.116315497)
 
 
 def coupling(
     within_tripod: Float[Array, ""] | float = 0.04, across: Float[Array, ""] | float = 0.40
 ) -> Float[Array, "6 6"]:
-    """Build W (eqs. 1, 3): weak inhibition inside a tripod, strong across, none of a leg on itself.
+    """Return W (eqs. 1, 3): weak inhibition within a tripod, strong across, none of a leg on itself.
 
-    The paper prints the two values the other way round, with which no start reaches a tripod (legs of one
-    tripod then settle a third of a cycle apart).
+    The paper prints the two values the other way round. With those, no start converges to a tripod gait: the legs of
+    one tripod settle a third of a cycle apart.
+
+    >>> print(coupling()[0])  # on the left front leg
+    [0.   0.4  0.04 0.4  0.04 0.4 ]
+
+    Args:
+        within_tripod: weight between legs of the same tripod.
+        across: weight between legs of different tripods.
     """
     tripod = np.arange(LEGS) % 2
     W = jnp.where(tripod[:, None] == tripod, within_tripod, across)
@@ -64,18 +70,18 @@ def coupling(
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """The network's constants (paper sec. 3.2), and how fast its time runs."""
+    """Constants of the network (paper sec. 3.2) and the time scale."""
 
     reaction_time: Float[Array, ""] | float = 1.7  # T_r, time units
     adaptation_time: Float[Array, ""] | float = 1.5  # T_a, time units
     self_inhibition: Float[Array, ""] | float = 7.0  # beta
-    mutual_inhibition: Float[Array, ""] | float = 4.0  # w_fe; the paper's -4 is its printed sign
+    mutual_inhibition: Float[Array, ""] | float = 4.0  # w_fe; the paper prints -4
     coupling: Float[Array, "6 6"] = struct.field(default_factory=coupling)  # W
-    tonic: Float[Array, "6 2"] | Float[Array, ""] | float = 1.0  # c_i; the rhythm's amplitude follows it
-    cycle_time: Float[Array, ""] | float = CYCLE_TIME  # s a cycle; no unit is printed
-    natural_period: Float[Array, ""] | float = NATURAL_PERIOD  # time units a cycle, `period` measures it
-    printed_sign: bool = struct.field(pytree_node=False, default=False)  # excite the other neuron of the pair
-    substeps: int = struct.field(pytree_node=False, default=4)  # Runge-Kutta steps in a `step`
+    tonic: Float[Array, "6 2"] | Float[Array, ""] | float = 1.0  # c_i; the amplitude is proportional to it
+    cycle_time: Float[Array, ""] | float = CYCLE_TIME  # s per cycle; the paper gives no unit
+    natural_period: Float[Array, ""] | float = NATURAL_PERIOD  # time units per cycle, as measured by `period`
+    printed_sign: bool = struct.field(pytree_node=False, default=False)  # w_fe excites instead of inhibiting
+    substeps: int = struct.field(pytree_node=False, default=4)  # Runge-Kutta steps per `step`
 
 
 @struct.dataclass(kw_only=True)
@@ -86,90 +92,107 @@ class State:
     adaptation: Float[Array, "6 2"]
 
 
-def settled(params: Params) -> State:
-    """Start on the limit cycle of the default parameters, in the tripod already, scaled by the drive.
+def limit_cycle_state(params: Params) -> State:
+    """Return a state on the limit cycle of the default parameters, in tripod phase and scaled by the tonic drive.
 
-    With other parameters it is still a state of exact antiphase, which the network keeps, and only the
-    waveform has a transient. A symmetric start would not do: all legs in step is a solution as well, though
-    an unstable one.
+    With other parameters the two tripods are still in exact antiphase, which the network preserves, and only the
+    waveform has a transient. A state with all legs in phase would not do: it is a solution too, but an unstable one.
     """
-    u, v = (_in_antiphase(even) * jnp.asarray(params.tonic) for even in (SETTLED_ACTIVATION, SETTLED_ADAPTATION))
+    u, v = (
+        _in_antiphase(even_leg) * jnp.asarray(params.tonic)
+        for even_leg in (LIMIT_CYCLE_ACTIVATION, LIMIT_CYCLE_ADAPTATION)
+    )
     return State(activation=u, adaptation=v)
 
 
 def init(params: Params, key: Array | None = None) -> State:
-    """Start settled, or, if a key is given, with every neuron at random in [0, 0.2] times its drive."""
+    """Return `limit_cycle_state`, or with a key a random state: uniform in [0, 0.2] times the tonic drive."""
     if key is None:
-        return settled(params)
+        return limit_cycle_state(params)
     start = jax.random.uniform(key, (2, LEGS, 2), dtype=float, maxval=0.2) * jnp.asarray(params.tonic)
     return State(activation=start[0], adaptation=start[1])
 
 
 def step(params: Params, state: State, interval: Float[Array, ""] | float) -> tuple[State, Float[Array, "6 2"]]:
-    """Advance the network by `interval` seconds with RK4 (eqs. 1-5); return its state and the rhythm there.
+    """Advance the network by `interval` seconds with RK4 (eqs. 1-5); return the new state and its rhythm.
 
-    The rectifier bends each neuron's course wherever its activation crosses zero, so over whole cycles RK4 is
-    of second order, not fourth; `substeps` equal steps inside the interval keep the error of period and
-    waveform below 1e-5 at 180 steps a cycle (a single one: 6e-5).
+    The rectifier has a kink wherever an activation crosses zero. Over whole cycles RK4 is therefore of second order,
+    not fourth. The error of period and waveform, at 180 calls per cycle:
+
+    | substeps    | error        |
+    | ----------- | ------------ |
+    | 1           | 6e-5         |
+    | 4 (default) | below 1e-5   |
+
+    >>> params = Params()
+    >>> state, rhythm = step(params, init(params), 1 / 30)
+    >>> rhythm.shape
+    (6, 2)
     """
     h = interval * params.natural_period / (params.cycle_time * params.substeps)
     for _ in range(params.substeps):
-        state = _runge_kutta(params, state, h)
+        state = _rk4_step(params, state, h)
     return state, rhythm(state)
 
 
 def rhythm(state: State) -> Float[Array, "6 2"]:
-    """Read each unit's output u_e - u_f (eq. 6) and adaptation difference v_e - v_f, left out in the paper.
+    """Return each unit's output u_e - u_f (eq. 6) and its adaptation difference v_e - v_f, which the paper leaves out.
 
-    The output alone passes each value twice a cycle; with the adaptation the pair is a closed loop without
-    crossing, from which the shaping network can tell stance from swing.
+    The output alone takes each value twice a cycle. Together with the adaptation difference it traces a closed loop
+    without self-intersection, by which the shaping network can distinguish stance from swing.
     """
     u, v = state.activation, state.adaptation
     return jnp.stack([u[:, EXTENSOR] - u[:, FLEXOR], v[:, EXTENSOR] - v[:, FLEXOR]], axis=1)
 
 
 def derivative(params: Params, state: State) -> State:
-    """Evaluate eqs. 1-4: the rates of activation and adaptation a time unit."""
+    """Return the rates of change of activation and adaptation per time unit (eqs. 1-4)."""
     u, v = state.activation, state.adaptation
     w_fe = -params.mutual_inhibition if params.printed_sign else params.mutual_inhibition
-    fired = jax.nn.relu(u)  # g, eq. 5
-    inhibition = w_fe * fired[:, ::-1] + params.self_inhibition * v + params.coupling @ fired
+    firing = jax.nn.relu(u)  # g, eq. 5
+    inhibition = w_fe * firing[:, ::-1] + params.self_inhibition * v + params.coupling @ firing
     return State(
         activation=(params.tonic - u - inhibition) / params.reaction_time,
-        adaptation=(fired - v) / params.adaptation_time,
+        adaptation=(firing - v) / params.adaptation_time,
     )
 
 
-def phases(outputs: Float[np.ndarray, "steps 6"], interval: float, cycle: float) -> Float[np.ndarray, "6"]:
-    """Measure each unit's phase in cycles, [0, 1), relative to the first, by its last upward zero crossing.
+def phases(outputs: Float[np.ndarray, "steps 6"], interval: float, cycle_time: float) -> Float[np.ndarray, "6"]:
+    """Return each unit's phase relative to the first [cycles, 0 to 1], measured at its last upward zero crossing.
 
     Host side. A unit that never crosses zero has phase NaN.
 
     Args:
-        outputs: u_e - u_f over time, steps `interval` apart.
+        outputs: u_e - u_f over time.
         interval: time between steps.
-        cycle: length of a cycle, in the unit of `interval`.
+        cycle_time: length of a cycle, in the unit of `interval`.
     """
-    last = np.array([(_rises(x) * interval)[-1:].sum() if _rises(x).size else np.nan for x in np.asarray(outputs).T])
-    return ((last - last[0]) / cycle) % 1.0
+    crossings = [_upward_crossings(x) for x in np.asarray(outputs).T]
+    last = np.array([(times * interval)[-1:].sum() if times.size else np.nan for times in crossings])
+    return ((last - last[0]) / cycle_time) % 1.0
 
 
-def period(outputs: Float[np.ndarray, "steps"], interval: float) -> float:
-    """Measure the mean time between upward zero crossings of one unit's output; NaN if it has less than two."""
-    rises = _rises(np.asarray(outputs))
-    return float((rises[-1] - rises[0]) / (len(rises) - 1) * interval) if len(rises) > 1 else math.nan
+def period(output: Float[np.ndarray, "steps"], interval: float) -> float:
+    """Return the mean time between upward zero crossings of one unit's output; NaN if there are fewer than two.
+
+    >>> round(period(np.sin(np.arange(100) / 10 * 2 * np.pi), 0.1), 6)
+    1.0
+    """
+    crossings = _upward_crossings(np.asarray(output))
+    count = len(crossings)
+    return float((crossings[-1] - crossings[0]) / (count - 1) * interval) if count > 1 else math.nan
 
 
-def first_rise(output: Float[np.ndarray, "steps"], interval: float) -> float:
-    """Find the time of one unit's first upward zero crossing; NaN if there is none."""
-    rises = _rises(np.asarray(output))
-    return float(rises[0] * interval) if len(rises) else math.nan
+def first_upward_crossing(output: Float[np.ndarray, "steps"], interval: float) -> float:
+    """Return the time of the first upward zero crossing of one unit's output; NaN if there is none."""
+    crossings = _upward_crossings(np.asarray(output))
+    return float(crossings[0] * interval) if len(crossings) else math.nan
 
 
 def check(params: Params) -> None:
-    """Raise `InputError` if a constant is not finite, not positive, or of another number of legs."""
+    """Raise `InputError` if a constant is not finite, not positive, or not for six legs."""
     if jnp.shape(params.coupling) != (LEGS, LEGS):
-        raise InputError(f"cpg coupling: expected shape (6, 6), got {jnp.shape(params.coupling)}; give a row a leg")
+        raise InputError(f"cpg coupling: expected shape (6, 6), got {jnp.shape(params.coupling)}; give one row per leg")
     for name in ("reaction_time", "adaptation_time", "cycle_time", "natural_period"):
         if not (value := float(getattr(params, name))) > 0 or not math.isfinite(value):
             raise InputError(f"cpg {name}: expected a positive finite number, got {value}; see cpg.Params")
@@ -181,25 +204,26 @@ def check(params: Params) -> None:
         raise InputError(f"cpg substeps: expected 1 or more, got {params.substeps}; the default is 4")
 
 
-def _in_antiphase(even: tuple[float, float]) -> Float[Array, "6 2"]:
-    return jnp.asarray([even, even[::-1]] * (LEGS // 2), dtype=float)
+def _in_antiphase(even_leg: tuple[float, float]) -> Float[Array, "6 2"]:
+    return jnp.asarray([even_leg, even_leg[::-1]] * (LEGS // 2), dtype=float)
 
 
-@jax.checkpoint  # in reverse mode XLA otherwise merges the steps, and computes the first anew for each that follows
-def _runge_kutta(params: Params, state: State, h: Float[Array, ""] | float) -> State:
-    """Take one classical fourth-order step of `h` time units."""
+# Without the checkpoint, XLA fuses the steps in reverse mode and computes the first again for each later one.
+@jax.checkpoint
+def _rk4_step(params: Params, state: State, h: Float[Array, ""] | float) -> State:
+    """Take one classical fourth-order Runge-Kutta step of `h` time units."""
 
-    def moved(rate: State, time: Float[Array, ""] | float) -> State:
+    def advanced(rate: State, time: Float[Array, ""] | float) -> State:
         return jax.tree.map(lambda x, dx: x + time * dx, state, rate)
 
     k1 = derivative(params, state)
-    k2 = derivative(params, moved(k1, h / 2))
-    k3 = derivative(params, moved(k2, h / 2))
-    k4 = derivative(params, moved(k3, h))
-    return moved(jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), h)
+    k2 = derivative(params, advanced(k1, h / 2))
+    k3 = derivative(params, advanced(k2, h / 2))
+    k4 = derivative(params, advanced(k3, h))
+    return advanced(jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4), h)
 
 
-def _rises(output: Float[np.ndarray, "steps"]) -> Float[np.ndarray, "crossings"]:
-    """Find upward zero crossings, in steps, by linear interpolation."""
+def _upward_crossings(output: Float[np.ndarray, "steps"]) -> Float[np.ndarray, "crossings"]:
+    """Return the times of upward zero crossings in steps, by linear interpolation."""
     before = np.flatnonzero((output[:-1] < 0) & (output[1:] >= 0))
     return before + output[before] / (output[before] - output[before + 1])

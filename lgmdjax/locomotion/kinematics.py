@@ -1,12 +1,12 @@
-"""The legs: how long, where they are, how they give under load, and their kinematics.
+"""Leg geometry, servo compliance, and forward and inverse kinematics.
 
 | symbol | name    | unit | meaning                                   |
 | ------ | ------- | ---- | ----------------------------------------- |
 | -      | angles  | rad  | coxa, femur, tibia of a leg               |
 | -      | feet    | m    | centres of the feet in the trunk's frame  |
 
-Joint zeros: leg straight out along its mount, femur level, tibia plumb; positive coxa turns left, positive
-femur and tibia lift. Source of the numbers: the robot's model.
+Joint zeros: leg straight out along its mount, femur horizontal, tibia vertical. A positive coxa angle turns the leg to
+the left, positive femur and tibia angles lift it. The numbers are read from the robot's model.
 """
 
 import jax.numpy as jnp
@@ -19,22 +19,22 @@ Scalar = Float[Array, ""] | float
 
 
 @struct.dataclass(kw_only=True)
-class Geometry:
-    """What the gait must know of the body: where the legs are, how long, and how they give under load."""
+class LegGeometry:
+    """Geometry of the legs, and compliance and lag of their servos."""
 
     mounts: Float[Array, "legs 3"]  # m, coxa axes in the trunk's frame
     mount_yaws: Float[Array, "legs"]  # rad
-    coxa: Scalar  # m
-    femur: Scalar
-    tibia: Scalar  # down to the foot's centre
-    foot_radius: Scalar
-    weight: Scalar  # N
+    coxa: Scalar  # m, length
+    femur: Scalar  # m, length
+    tibia: Scalar  # m, length to the foot's centre
+    foot_radius: Scalar  # m
+    weight: Scalar  # N, of the robot
     stiffness: Scalar  # N m/rad, of a servo
-    lag: Scalar  # s, by which a servo trails a steady motion
+    lag: Scalar  # s, delay of a servo behind a steady motion
 
 
-def geometry(model: mujoco.MjModel) -> Geometry:
-    """Read the legs off a model whose actuators are coxa, femur and tibia of each leg, in leg order."""
+def read_geometry(model: mujoco.MjModel) -> LegGeometry:
+    """Return the geometry of a model whose actuators are coxa, femur and tibia of each leg, in leg order."""
     joints = model.actuator_trnid[:, 0].reshape(6, 3)
     bodies = model.jnt_bodyid[joints]
     w, _, _, z = model.body_quat[bodies[:, 0]].T
@@ -43,7 +43,7 @@ def geometry(model: mujoco.MjModel) -> Geometry:
         for tibia in bodies[:, 2]
     ]
     stiffness = float(model.actuator_gainprm[0, 0])
-    return Geometry(
+    return LegGeometry(
         mounts=jnp.asarray(model.body_pos[bodies[:, 0]], dtype=float),
         mount_yaws=jnp.asarray(2 * np.arctan2(z, w), dtype=float),
         coxa=float(model.body_pos[bodies[0, 1], 0]),
@@ -56,8 +56,16 @@ def geometry(model: mujoco.MjModel) -> Geometry:
     )
 
 
-def forward(geometry: Geometry, angles: Float[Array, "*batch legs 3"]) -> Float[Array, "*batch legs 3"]:
-    """Find the feet [m, trunk's frame] that joint angles [rad] lead to."""
+def forward(geometry: LegGeometry, angles: Float[Array, "*batch legs 3"]) -> Float[Array, "*batch legs 3"]:
+    """Return the positions of the feet [m, trunk's frame] for joint angles [rad].
+
+    >>> leg = LegGeometry(
+    ...     mounts=jnp.zeros((1, 3)), mount_yaws=jnp.zeros(1), coxa=0.05, femur=0.07, tibia=0.1,
+    ...     foot_radius=0.01, weight=30.0, stiffness=10.0, lag=0.02,
+    ... )
+    >>> print(forward(leg, jnp.zeros((1, 3))).round(3))
+    [[ 0.12  0.   -0.1 ]]
+    """
     coxa, femur, tibia = jnp.moveaxis(angles, -1, 0)
     reach = geometry.coxa + geometry.femur * jnp.cos(femur) + geometry.tibia * jnp.sin(femur + tibia)
     rise = geometry.femur * jnp.sin(femur) - geometry.tibia * jnp.cos(femur + tibia)
@@ -65,12 +73,12 @@ def forward(geometry: Geometry, angles: Float[Array, "*batch legs 3"]) -> Float[
     return geometry.mounts + jnp.stack([reach * jnp.cos(yaw), reach * jnp.sin(yaw), rise], axis=-1)
 
 
-def inverse(geometry: Geometry, feet: Float[Array, "*batch legs 3"]) -> Float[Array, "*batch legs 3"]:
-    """Find the joint angles [rad], knee up, that put the feet [m, trunk's frame] there.
+def inverse(geometry: LegGeometry, feet: Float[Array, "*batch legs 3"]) -> Float[Array, "*batch legs 3"]:
+    """Return the joint angles [rad], with the knee up, for positions of the feet [m, trunk's frame].
 
-    A foot out of reach gets the angles of the stretched or folded leg in its direction.
+    For a foot out of reach they are the angles of the stretched or folded leg in its direction.
 
-    Gradient: exact within reach; zero for the knee beyond it; zero for the coxa with the foot on its axis.
+    Gradient: exact within reach; zero for the knee out of reach; zero for the coxa with the foot on its axis.
     """
     x, y, rise = jnp.moveaxis(feet - geometry.mounts, -1, 0)
     yaw, distance = _polar(x, y)
@@ -84,13 +92,13 @@ def inverse(geometry: Geometry, feet: Float[Array, "*batch legs 3"]) -> Float[Ar
 
 
 def _polar(x: Float[Array, "*n"], y: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Angle and length of a vector, both with gradient zero where it vanishes."""
+    """Return the angle and the length of a vector, both with gradient zero where the vector is zero."""
     zero = (x == 0) & (y == 0)
     safe = jnp.where(zero, 1.0, x)
     return jnp.where(zero, 0.0, jnp.arctan2(y, safe)), jnp.where(zero, 0.0, jnp.sqrt(safe**2 + y**2))
 
 
 def _arccos(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Arc cosine of the clipped argument, with gradient zero where it is clipped."""
+    """Return the arc cosine of the argument clipped to -1..1, with gradient zero where it is clipped."""
     inside = jnp.abs(x) < 1
     return jnp.where(inside, jnp.arccos(jnp.where(inside, x, 0.0)), jnp.where(x > 0, 0.0, jnp.pi))

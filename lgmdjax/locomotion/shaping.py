@@ -1,9 +1,9 @@
-"""Shaping networks: one a leg, from the CPG unit's rhythm and the side's velocity to three joint angles.
+"""Shaping networks: one per leg, from the rhythm of its CPG unit and the velocity of its side to three joint angles.
 
-Six rectified units and a linear output, as the paper has it, but for one more input: the unit's adaptation
-difference. From the output u_e - u_f alone a static map can only trace an open curve back and forth; fitted
-so (`literal`), the robot hardly walks. With the adaptation difference the two make a closed loop, from which
-stance and swing differ.
+Each network has six rectified units and a linear output, as in the paper, but one more input: the unit's adaptation
+difference. A static map of the output u_e - u_f alone can only trace an open curve back and forth, and a robot with
+networks fitted to this input (`printed_input`) hardly walks. Output and adaptation difference together trace a closed
+loop, by which stance and swing can differ.
 
 | symbol         | name          | unit             | equation  |
 | -------------- | ------------- | ---------------- | --------- |
@@ -12,10 +12,9 @@ stance and swing differ.
 | v^left, right  | velocity      | nominal velocity | sec. 3.2  |
 | -              | targets       | rad              | sec. 3.2  |
 
-Source: Cizek & Faigl, sec. 3.2. The networks are taught by `lgmdjax.locomotion.gait_fit.teach`.
+Source: Cizek & Faigl, sec. 3.2. `lgmdjax.locomotion.gait_fit.fit` fits the networks.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,57 +24,71 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save as serialise
 
-from lgmdjax.errors import InputError
-from lgmdjax.paths import SHAPING
+from lgmdjax.paths import SHAPING_FILE
+from lgmdjax.runtime import storage
+from lgmdjax.runtime.storage import JsonObject
 
 LEGS, INPUTS, UNITS, JOINTS = 6, 3, 6, 3
-SLOWEST, FASTEST = -1.0, 2.0  # the range of velocities that the networks are taught, and so what the legs can do
-FORMAT, VERSION = "lgmdjax.shaping", "1"
+MIN_VELOCITY, MAX_VELOCITY = -1.0, 2.0  # nominal velocities; the range for which the networks are fitted
+FILE = storage.TensorFile(
+    format="lgmdjax.shaping", version="1", name="shaping networks", remedy="`lgmdjax fit-gait` makes one"
+)
 SHAPES = {
     "w1": (LEGS, INPUTS, UNITS),
     "b1": (LEGS, UNITS),
     "w2": (LEGS, UNITS, JOINTS),
     "b2": (LEGS, JOINTS),
 }
-COXA_REVERSED = np.array([-1.0, 1.0, 1.0])  # joint angles seen in a mirror; legs go round the body, so their order too
+MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])  # of mirrored joint angles; mirroring also reverses the leg order
 
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """Weights of the six networks; inputs are output, adaptation difference and velocity, outputs radians."""
+    """Weights of the six networks.
+
+    The inputs are CPG output, adaptation difference and velocity; the outputs are joint angles in radians.
+    """
 
     w1: Float[Array, "6 3 6"]
     b1: Float[Array, "6 6"]
     w2: Float[Array, "6 6 3"]
     b2: Float[Array, "6 3"]
-    literal: bool = struct.field(pytree_node=False, default=False)  # the paper's input: no adaptation difference
+    printed_input: bool = struct.field(pytree_node=False, default=False)  # as in the paper: no adaptation difference
 
 
-def init(key: Array, *, literal: bool = False) -> Params:
-    """Draw untaught networks: weights of the size that suits inputs and angles of order one, no biases."""
+def init(key: Array, *, printed_input: bool = False) -> Params:
+    """Return randomly initialised networks, with weights scaled to inputs and angles of order one, and zero biases."""
     first, second = jax.random.split(key)
     return Params(
         w1=jax.random.normal(first, SHAPES["w1"], dtype=float) / np.sqrt(INPUTS),
         b1=jnp.zeros(SHAPES["b1"]),
         w2=jax.random.normal(second, SHAPES["w2"], dtype=float) / np.sqrt(UNITS),
         b2=jnp.zeros(SHAPES["b2"]),
-        literal=literal,
+        printed_input=printed_input,
     )
 
 
-def shape(params: Params, rhythm: Float[Array, "6 2"], velocity: Float[Array, "2"]) -> Float[Array, "6 3"]:
-    """Map the rhythm and the velocities (left, right) to joint targets [rad], a leg a row.
+def apply(params: Params, rhythm: Float[Array, "6 2"], velocity: Float[Array, "2"]) -> Float[Array, "6 3"]:
+    """Return the joint targets [rad], one row per leg.
 
-    The velocity acts at once. Beyond the taught range, [-1, 2], the networks go on linearly: limit it before.
+    The velocity acts without delay. The networks extrapolate linearly beyond the range of the fit, [-1, 2], so limit
+    the velocity to it.
 
-    Gradient: exact almost everywhere; zero through a unit that is silent, and in `literal` networks through
+    Gradient: exact almost everywhere; zero through a unit whose activation is zero, and with `printed_input` through
     the adaptation difference and its weights.
+
+    >>> targets = apply(load_pretrained(), jnp.zeros((6, 2)), velocity=jnp.ones(2))
+    >>> targets.shape
+    (6, 3)
+
+    Args:
+        params: of the networks.
+        rhythm: of the CPG, output and adaptation difference of each unit.
+        velocity: of the left and the right side, 1 being nominal.
     """
     output, adaptation = rhythm[:, 0], rhythm[:, 1]
-    if params.literal:
+    if params.printed_input:
         adaptation = jnp.zeros_like(adaptation)
     inputs = jnp.stack([output, adaptation, jnp.repeat(velocity, LEGS // 2)], axis=1)
     units = jax.nn.relu(jnp.einsum("li,liu->lu", inputs, params.w1) + params.b1)
@@ -83,65 +96,41 @@ def shape(params: Params, rhythm: Float[Array, "6 2"], velocity: Float[Array, "2
 
 
 def mirror(params: Params) -> Params:
-    """Exchange the networks of left and right: what they give is the mirror image."""
-    reversed_coxa = jnp.asarray(COXA_REVERSED, dtype=params.w2.dtype)  # the networks keep their precision
-    signs = {"w1": 1.0, "b1": 1.0, "w2": reversed_coxa, "b2": reversed_coxa}
+    """Return the networks of the mirrored robot: those of left and right exchanged, with the coxa angle reversed."""
+    joint_signs = jnp.asarray(MIRROR_SIGNS, dtype=params.w2.dtype)  # so that the weights keep their precision
+    signs = {"w1": 1.0, "b1": 1.0, "w2": joint_signs, "b2": joint_signs}
     return replace(params, **{name: getattr(params, name)[::-1] * sign for name, sign in signs.items()})
 
 
-def symmetric(params: Params) -> Params:
-    """Give the right legs the left ones' networks, mirrored: a mirrored rhythm and command give mirrored targets."""
+def symmetrise(params: Params) -> Params:
+    """Return networks whose right legs mirror the left ones.
+
+    A mirrored rhythm and command then give mirrored targets.
+    """
     left = LEGS // 2
     return jax.tree.map(lambda own, image: jnp.concatenate([own[:left], image[left:]]), params, mirror(params))
 
 
 def save(path: Path | str, params: Params, metadata: Mapping[str, object] | None = None) -> None:
-    """Write the networks as one safetensors file in single precision, `metadata` (JSON values) in its header.
-
-    The file is written beside its place and moved there, so that no reader finds half of one.
-    """
-    path = Path(path)
-    header = {"format": FORMAT, "version": VERSION, "literal": json.dumps(params.literal)}
-    header |= {name: json.dumps(value) for name, value in (metadata or {}).items()}
-    partial = path.with_name(path.name + ".part")
+    """Write the networks to a safetensors file in single precision, with `metadata` (JSON values) in its header."""
     weights = {name: np.asarray(getattr(params, name), np.float32) for name in SHAPES}
-    try:
-        partial.write_bytes(serialise(weights, header))
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: expected a place to write to, got {error.strerror}; choose another") from error
+    storage.save_tensors(path, weights, FILE, {"literal": params.printed_input, **(metadata or {})})
 
 
 def load(path: Path | str) -> Params:
-    """Read networks that `save` wrote; raise `InputError` for another, damaged or outdated file."""
-    again = "`lgmdjax fit-gait` makes one"
-    try:
-        with safe_open(path, framework="numpy") as file:
-            header = file.metadata() or {}
-            if header.get("format") != FORMAT:
-                raise InputError(f"{path}: expected shaping networks, got another kind of file; {again}")
-            if header.get("version") != VERSION:
-                raise InputError(f"{path}: expected version {VERSION}, got {header.get('version')}; {again}")
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-    except (OSError, SafetensorError) as error:
-        raise InputError(f"{path}: expected safetensors with shaping networks, got {error}; {again}") from error
-    found = {name: weight.shape for name, weight in weights.items()}
-    if found != SHAPES:
-        raise InputError(f"{path}: expected weights {SHAPES}, got {found}; {again}")
-    if not all(np.isfinite(weight).all() for weight in weights.values()):
-        raise InputError(f"{path}: expected finite weights, got some that are not; {again}")
+    """Return the networks that `save` wrote; raise `InputError` for another, damaged or outdated file."""
+    weights, metadata = storage.load_tensors(path, FILE)
+    storage.check_shapes(path, weights, FILE, SHAPES)
     arrays = {name: jnp.asarray(weight, dtype=float) for name, weight in weights.items()}
-    return Params(**arrays, literal=header.get("literal") == "true")
+    return Params(**arrays, printed_input=metadata.get("literal") is True)
 
 
-def metadata(path: Path | str) -> dict[str, object]:
-    """Read what a file of networks says about itself."""
-    load(path)
-    with safe_open(path, framework="numpy") as file:
-        header = dict(file.metadata())
-    return {name: value if name in ("format", "version") else json.loads(value) for name, value in header.items()}
+def read_metadata(path: Path | str) -> JsonObject:
+    """Return the metadata in the header of a file that `save` wrote, with its format and version."""
+    _, metadata = storage.load_tensors(path, FILE)
+    return {"format": FILE.format, "version": FILE.version, **metadata}
 
 
-def taught() -> Params:
-    """Load the networks that come with the package, as `experiments/teach_gait.py` made them."""
-    return load(SHAPING)
+def load_pretrained() -> Params:
+    """Load the networks of the package, which `experiments/fit_default_gait.py` fitted."""
+    return load(SHAPING_FILE)

@@ -1,19 +1,19 @@
-"""The regular tripod gait in foot space, and the servo targets that make a robot walk it.
+"""Regular tripod gait in foot space, and the servo targets that make a robot walk it.
 
-Three legs stand while three swing. A standing foot goes backward at constant speed, so that the trunk goes
-forward smoothly; a swinging foot returns in an arc and meets the floor at the floor's own speed. A side's
-stride is proportional to its velocity. `targets` turns that into servo targets, ahead of the servos' lag and
-beyond their sag under the trunk's weight; `lgmdjax.locomotion.gait_fit` teaches the shaping networks that.
+Three legs stand while three swing. A standing foot moves backward at constant speed, so that the trunk moves forward
+smoothly. A swinging foot returns in an arc and touches the floor at the speed of the floor. The stride of a side is
+proportional to its velocity. `joint_targets` converts the foot paths to servo targets that compensate for the servos'
+lag and for their compliance under the trunk's weight; `lgmdjax.locomotion.gait_fit` fits the shaping networks to them.
 
-| symbol | name       | unit             | meaning                                   |
-| ------ | ---------- | ---------------- | ----------------------------------------- |
-| v      | velocity   | nominal velocity | of a leg's side, in [-1, 2]               |
-| p      | phase      | cycles           | 0 at touch-down, `duty` at lift-off       |
-| q      | -          | 1                | progress of the swing, 0 to 1             |
-| -      | feet       | m                | centres of the feet in the trunk's frame  |
+| symbol | name       | unit             | meaning                                          |
+| ------ | ---------- | ---------------- | ------------------------------------------------ |
+| v      | velocity   | nominal velocity | of a leg's side, in [-1, 2]                      |
+| p      | phase      | cycles           | 0 at touch-down, `duty_factor` at lift-off       |
+| q      | -          | 1                | progress of the swing, 0 to 1                    |
+| -      | feet       | m                | centres of the feet in the trunk's frame         |
 
-Source: Cizek & Faigl, sec. 3.2 and fig. 5c; the "regular gait" of Mrva & Faigl 2015, for which the paper
-gives no formula. The legs' kinematics are in `lgmdjax.locomotion.kinematics` and can be had from here.
+Source: Cizek & Faigl, sec. 3.2 and fig. 5c; the "regular gait" of Mrva & Faigl 2015, for which the paper gives no
+formula.
 """
 
 import jax
@@ -22,47 +22,60 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from lgmdjax.locomotion import cpg
-from lgmdjax.locomotion.kinematics import Geometry as Geometry
-from lgmdjax.locomotion.kinematics import Scalar
-from lgmdjax.locomotion.kinematics import forward as forward
-from lgmdjax.locomotion.kinematics import geometry as geometry
-from lgmdjax.locomotion.kinematics import inverse as inverse
+from lgmdjax.locomotion import cpg, kinematics
+from lgmdjax.locomotion.kinematics import LegGeometry, Scalar
 
 
 @struct.dataclass(kw_only=True)
 class Gait:
-    """The gait's figures, chosen for little sway of the trunk, which carries the eyes, and a quick turn.
+    """Parameters of the gait, chosen for little sway of the trunk, which carries the cameras, and for quick turns.
 
-    The feet stand closer in than the Mark II's (0.14 m from the coxa). There a sideways push on a foot hardly
-    raises or lowers it, and front and rear feet drag less when the robot turns: on the spot at 0.19 rad/s
-    instead of 0.14, with 0.02 degrees RMS of pitch instead of 0.16. The feet's centres are then 0.40 m apart at
-    the widest; the paper's robot is 0.40 m wide.
+    The feet are closer to the body than those of the Mark II (0.14 m from the coxa). A sideways push on a foot then
+    hardly raises or lowers it, and front and rear feet slip less in a turn. The feet's centres are 0.40 m apart at the
+    widest; the paper's robot is 0.40 m wide.
+
+    |                                  | here | Mark II |
+    | -------------------------------- | ---- | ------- |
+    | turn on the spot [rad/s]         | 0.19 | 0.14    |
+    | pitch, root mean square [deg]    | 0.02 | 0.16    |
     """
 
     nominal_velocity: Scalar = 0.05  # m/s at v = 1
     cycle_time: Scalar = cpg.CYCLE_TIME  # s; that of the rhythm
-    duty: Scalar = 0.55  # share of the cycle that a foot stands; the tripods overlap by what is over 0.5
-    lift: Scalar = 0.02  # m
-    height: Scalar = 0.10  # m, trunk's centre above the feet's centres
-    front: tuple[float, float] = struct.field(pytree_node=False, default=(0.155, 0.145))  # m, left front foot's home
-    middle: float = struct.field(pytree_node=False, default=0.20)  # m, left middle foot's home, to the side
-    stride_gain: Scalar = 1.02  # makes up for what the feet slip
+    duty_factor: Scalar = 0.55  # fraction of the cycle in stance; the tripods overlap by the excess over 0.5
+    swing_height: Scalar = 0.02  # m
+    body_height: Scalar = 0.10  # m, of the trunk's centre above the feet's centres
+    front_foot: tuple[float, float] = struct.field(pytree_node=False, default=(0.155, 0.145))  # m, left, neutral x, y
+    middle_foot: float = struct.field(pytree_node=False, default=0.20)  # m, left, neutral y
+    stride_gain: Scalar = 1.02  # compensates for slip
 
 
-def homes(gait: Gait) -> Float[Array, "6 3"]:
-    """Place the feet's mid-stance points [m, trunk's frame], in leg order."""
-    floor = jnp.asarray(_floor(gait), dtype=float)
-    return jnp.concatenate([floor, -gait.height * jnp.ones((6, 1))], axis=1)
+def neutral_feet(gait: Gait) -> Float[Array, "6 3"]:
+    """Return the positions of the feet in mid-stance [m, trunk's frame], in leg order.
+
+    >>> print(neutral_feet(Gait())[:2])
+    [[ 0.155  0.145 -0.1  ]
+     [ 0.     0.2   -0.1  ]]
+    """
+    plan = jnp.asarray(_neutral_plan(gait), dtype=float)
+    return jnp.concatenate([plan, -gait.body_height * jnp.ones((6, 1))], axis=1)
 
 
 def foot_path(gait: Gait, phase: Float[Array, "*batch"], velocity: Float[Array, "*batch"]) -> Float[Array, "*batch 3"]:
-    """Trace a foot relative to its home [m]: backward in stance, and in an arc back again.
+    """Return the position of a foot relative to its neutral position [m]: backward in stance, in an arc in swing.
 
-    The swing is a cubic that leaves and meets the floor with the stance's velocity, and its height a bump
-    that begins and ends flat. At v = 0 the foot steps on the spot.
+    The swing is a cubic that leaves and meets the floor with the velocity of the stance. Its height begins and ends
+    with zero vertical velocity. At v = 0 the foot steps on the spot.
+
+    >>> print(foot_path(Gait(), jnp.array(0.0), jnp.array(1.0)).round(4))  # at touch-down
+    [0.0112 0.     0.    ]
+
+    Args:
+        gait: of the robot.
+        phase: of the leg [cycles].
+        velocity: of the leg's side, 1 being nominal.
     """
-    p, d = jnp.mod(phase, 1.0), gait.duty
+    p, d = jnp.mod(phase, 1.0), gait.duty_factor
     speed = gait.nominal_velocity * gait.stride_gain * velocity
     stride = speed * gait.cycle_time * d
     stance = stride * (0.5 - p / d)
@@ -70,50 +83,59 @@ def foot_path(gait: Gait, phase: Float[Array, "*batch"], velocity: Float[Array, 
     reach = stride * (q**2 * (3 - 2 * q) - 0.5)
     ends = speed * gait.cycle_time * (1 - d) * (q - q**2) * (2 * q - 1)  # backward speed at both ends
     x = jnp.where(p < d, stance, reach + ends)
-    return jnp.stack([x, jnp.zeros_like(x), gait.lift * (4 * q * (1 - q)) ** 2], axis=-1)
+    return jnp.stack([x, jnp.zeros_like(x), gait.swing_height * (4 * q * (1 - q)) ** 2], axis=-1)
 
 
 def load_share(gait: Gait, phase: Float[Array, "*batch 6"], x: Float[Array, "*batch 6"]) -> Float[Array, "*batch 6"]:
-    """Share the weight among standing legs: by statics within a tripod, handed over smoothly between the two.
+    """Return the fraction of the weight on each leg: statics within a tripod, a smooth transfer between the two.
 
     Args:
-        phase: of each leg.
-        x: each foot's way from home [m]; the other two of its tripod are taken to be as far from theirs.
+        gait: of the robot.
+        phase: of each leg [cycles].
+        x: displacement of each foot from its neutral position [m]; the other two feet of its tripod are assumed to
+            have the same displacement.
     """
-    floor = _floor(gait)
-    shares = np.zeros((2, 6))
-    for legs in (slice(0, 6, 2), slice(1, 6, 2)):
-        balance = np.linalg.inv(np.column_stack([np.ones(3), floor[legs]]).T)  # forces and moments add up
-        shares[:, legs] = balance[:, 0], -balance[:, 1]
-    p, overlap = jnp.mod(phase, 1.0), jnp.maximum(gait.duty - 0.5, 1e-3)
-    bears = _smooth_step(p / overlap) * _smooth_step((gait.duty - p) / overlap)
-    return bears * (jnp.asarray(shares[0], dtype=float) + jnp.asarray(shares[1], dtype=float) * x)
+    plan = _neutral_plan(gait)
+    coefficients = np.zeros((2, 6))  # of the load in mid-stance, and of its change with x
+    for tripod in (slice(0, 6, 2), slice(1, 6, 2)):
+        balance = np.linalg.inv(np.column_stack([np.ones(3), plan[tripod]]).T)  # of forces and moments
+        coefficients[:, tripod] = balance[:, 0], -balance[:, 1]
+    p, overlap = jnp.mod(phase, 1.0), jnp.maximum(gait.duty_factor - 0.5, 1e-3)
+    standing = _smooth_step(p / overlap) * _smooth_step((gait.duty_factor - p) / overlap)
+    return standing * (jnp.asarray(coefficients[0], dtype=float) + jnp.asarray(coefficients[1], dtype=float) * x)
 
 
-def targets(
-    geometry: Geometry, gait: Gait, phase: Float[Array, "*batch 6"], velocity: Float[Array, "*batch 6"]
+def joint_targets(
+    geometry: LegGeometry, gait: Gait, phase: Float[Array, "*batch 6"], velocity: Float[Array, "*batch 6"]
 ) -> Float[Array, "*batch 6 3"]:
-    """Compute servo targets [rad] that make the feet follow the gait: ahead of the lag, beyond the sag.
+    """Return servo targets [rad] that make the feet follow the gait despite the servos' lag and compliance.
 
-    A position servo trails by its lag, and gives by torque / stiffness under the weight on its leg; each leg
-    knows only its own phase and velocity, as its network does.
+    A position servo is late by its lag, and under the weight on its leg it deviates by torque / stiffness. Each leg's
+    targets depend only on its own phase and velocity, as those of its network do.
+
+    Args:
+        geometry: of the legs.
+        gait: of the robot.
+        phase: of each leg [cycles].
+        velocity: of each leg's side, 1 being nominal.
     """
 
     def angles_at(phase: Float[Array, "*batch 6"]) -> Float[Array, "*batch 6 3"]:
-        return inverse(geometry, homes(gait) + foot_path(gait, phase, velocity))
+        return kinematics.inverse(geometry, neutral_feet(gait) + foot_path(gait, phase, velocity))
 
     angles, rate = jax.jvp(angles_at, (phase,), (jnp.ones_like(phase) / gait.cycle_time,))
     load = geometry.weight * load_share(gait, phase, foot_path(gait, phase, velocity)[..., 0])
     _, femur, tibia = jnp.moveaxis(angles, -1, 0)
-    shank = geometry.tibia * jnp.sin(femur + tibia)  # how far a joint is from above the foot is its lever arm
+    # The lever arm of a joint is its horizontal distance from the foot.
+    shank = geometry.tibia * jnp.sin(femur + tibia)
     levers = jnp.stack([jnp.zeros_like(shank), geometry.femur * jnp.cos(femur) + shank, shank], axis=-1)
     return angles + geometry.lag * rate - load[..., None] * levers / geometry.stiffness
 
 
-def _floor(gait: Gait) -> Float[np.ndarray, "6 2"]:
-    """Feet's homes seen from above [m]."""
-    x, y = gait.front
-    return np.array([(x, y), (0, gait.middle), (-x, y), (-x, -y), (0, -gait.middle), (x, -y)], float)
+def _neutral_plan(gait: Gait) -> Float[np.ndarray, "6 2"]:
+    """Return the neutral positions of the feet in plan view [m]."""
+    x, y = gait.front_foot
+    return np.array([(x, y), (0, gait.middle_foot), (-x, y), (-x, -y), (0, -gait.middle_foot), (x, -y)], float)
 
 
 def _smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -1,1 +1,5 @@
 """The stages of `lgmdjax reproduce`, their settings at three scales, and the report page."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

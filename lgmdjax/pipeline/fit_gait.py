@@ -1,4 +1,4 @@
-"""Stage fit-gait: teach the shaping networks the tripod gait, and walk them on an empty floor in both simulators.
+"""Stage fit-gait: fit the shaping networks to the tripod gait, and simulate walks on an empty floor.
 
 Writes shaping.safetensors, gait.json (speeds, turning, sway), cpg.npz (fig. 5b) and foot.npz (fig. 5c).
 """
@@ -6,79 +6,106 @@ Writes shaping.safetensors, gait.json (speeds, turning, sway), cpg.npz (fig. 5b)
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.evaluation import gait_test
+from lgmdjax.evaluation.gait_test import GaitTrajectory
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
 from lgmdjax.pipeline.settings import FitGaitSettings
-from lgmdjax.runtime.storage import write_json
+from lgmdjax.runtime.storage import JsonObject, write_json
 
-SWEEP = ((1.0, 1.0), (0.5, 0.5), (1.2, 1.2), (2.0, 2.0), (-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0))
-DRAWN = ((0.5, 0.5), (1.0, 1.0), (2.0, 2.0))  # fig. 5c
+SWEEP_COMMANDS = (
+    (1.0, 1.0),
+    (0.5, 0.5),
+    (1.2, 1.2),
+    (2.0, 2.0),
+    (-1.0, -1.0),
+    (-1.0, 1.0),
+    (1.0, -1.0),
+)  # v left, right
+PLOTTED_COMMANDS = ((0.5, 0.5), (1.0, 1.0), (2.0, 2.0))  # fig. 5c
 STRAIGHT = (1.0, 1.0)
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: FitGaitSettings, seed: int) -> None:
-    """Fit both forms of the shaping input, and measure the walks."""
+class Condition(NamedTuple):
+    """A commanded velocity, and the form of the shaping networks' input."""
+
+    velocity: tuple[float, float]  # left, right
+    printed_input: bool = False  # the single input of the paper
+
+
+CONDITIONS = (*(Condition(velocity) for velocity in SWEEP_COMMANDS), Condition(STRAIGHT, printed_input=True))
+Targets = Mapping[Condition, Float[Array, "steps 6 3"]]
+Walks = Mapping[Condition, Mapping[str, GaitTrajectory]]  # by condition and simulator, "mjx" or "c"
+
+
+def run(folder: Path, inputs: Mapping[str, Path], settings: FitGaitSettings, seed: int) -> None:
+    """Fit networks with both forms of the input, and measure walks with them in both simulators."""
     body = hexapod.load()
-    networks = {literal: _teach(body, settings, seed, literal) for literal in (False, True)}
+    networks = {printed: _fit(body, settings, seed, printed) for printed in (False, True)}
     shaping.save(folder / "shaping.safetensors", networks[False], {"steps": settings.steps, "seed": seed})
-    rhythm = cpg.Params()
-    np.savez(folder / "cpg.npz", allow_pickle=False, **_onset(rhythm, seed))
-    courses = {
-        (velocity, literal): gait_test.targets(
-            rhythm, networks[literal], jnp.asarray(velocity), steps=round(settings.seconds / gait_test.STEP)
+    cpg_params = cpg.Params()
+    np.savez(folder / "cpg.npz", allow_pickle=False, **_onset(cpg_params, seed))
+    steps = round(settings.seconds / gait_test.TIME_STEP)
+    targets = {
+        condition: gait_test.servo_targets(
+            cpg_params, networks[condition.printed_input], jnp.asarray(condition.velocity), steps=steps
         )
-        for velocity, literal in [*((velocity, False) for velocity in SWEEP), (STRAIGHT, True)]
+        for condition in CONDITIONS
     }
     print("fit-gait: compiling the physics, then walking on an empty floor", flush=True)
-    mjx = gait_test.walk_mjx(hexapod.build(body), jnp.stack(list(courses.values())))
+    in_mjx = gait_test.simulate_mjx(hexapod.build(body), jnp.stack(list(targets.values())))
     walks = {
-        name: {"mjx": walk, "c": gait_test.walk_c(body, course)}
-        for (name, course), walk in zip(courses.items(), mjx, strict=True)
+        condition: {"mjx": walk, "c": gait_test.simulate_mujoco(body, own)}
+        for (condition, own), walk in zip(targets.items(), in_mjx, strict=True)
     }
-    write_json(folder / "gait.json", _summary(walks, float(rhythm.cycle_time)))
-    np.savez(folder / "foot.npz", allow_pickle=False, **_foot_paths(body, courses, walks, float(rhythm.cycle_time)))
+    write_json(folder / "gait.json", _summary(walks, float(cpg_params.cycle_time)))
+    np.savez(folder / "foot.npz", allow_pickle=False, **_foot_paths(body, targets, walks, float(cpg_params.cycle_time)))
 
 
-def _teach(body: Any, settings: FitGaitSettings, seed: int, literal: bool) -> shaping.Params:
-    name = "the paper's input" if literal else "the corrected input"
+def _fit(body: mujoco.MjModel, settings: FitGaitSettings, seed: int, printed_input: bool) -> shaping.Params:
+    name = "the paper's input" if printed_input else "the corrected input"
     with tqdm(total=settings.steps, desc=f"fit-gait: {name}", unit="step") as bar:
 
         def show(done: int, loss: float) -> None:
             bar.set_postfix_str(f"{math.sqrt(max(loss, 0)):.2f} mm", refresh=False)
             bar.update(done - bar.n)
 
-        return gait_fit.teach(
-            kinematics.geometry(body), key=jax.random.key(seed), steps=settings.steps, literal=literal, progress=show
-        )
+        geometry, key = kinematics.read_geometry(body), jax.random.key(seed)
+        return gait_fit.fit(geometry, key=key, steps=settings.steps, printed_input=printed_input, progress=show)
 
 
-def _onset(network: cpg.Params, seed: int, cycles: int = 12) -> dict[str, Any]:
-    """Start the rhythm at random and see how long it takes to become a tripod (fig. 5b)."""
-    cycle, steps = float(network.cycle_time), round(cycles * float(network.cycle_time) / gait_test.STEP)
+def _onset(network: cpg.Params, seed: int, cycles: int = 12) -> dict[str, np.ndarray | float]:
+    """Start the CPG in a random state, and measure how long the tripod takes to form (fig. 5b)."""
+    cycle, steps = float(network.cycle_time), round(cycles * float(network.cycle_time) / gait_test.TIME_STEP)
     state = cpg.init(network, jax.random.key(seed))
-    _, rhythm = jax.lax.scan(lambda s, _: cpg.step(network, s, gait_test.STEP), state, length=steps)
-    outputs = np.asarray(rhythm[..., 0])
-    # Two legs of one tripod say the same, and the other tripod the opposite, once it has formed.
+    _, signal = jax.lax.scan(lambda s, _: cpg.step(network, s, gait_test.TIME_STEP), state, length=steps)
+    outputs = np.asarray(signal[..., 0])
+    # In a tripod, the outputs of its legs are equal, and those of the other tripod are their negative.
     error = np.abs(outputs - outputs[:, :1] * np.where(np.arange(6) % 2, -1.0, 1.0)).max(axis=1)
-    formed = np.flatnonzero(error > 0.05 * np.abs(outputs).max())
+    unformed = np.flatnonzero(error > 0.05 * np.abs(outputs).max())
     return {
-        "time": np.arange(steps) * gait_test.STEP,
+        "time": np.arange(steps) * gait_test.TIME_STEP,
         "rhythm": outputs,
-        "transient_cycles": (formed[-1] + 1 if formed.size else 0) * gait_test.STEP / cycle,
-        "period": cpg.period(outputs[steps // 2 :, 0], gait_test.STEP),
+        "transient_cycles": (unformed[-1] + 1 if unformed.size else 0) * gait_test.TIME_STEP / cycle,
+        "period": cpg.period(outputs[steps // 2 :, 0], gait_test.TIME_STEP),
     }
 
 
-def _summary(walks: Mapping[Any, Mapping[str, gait_test.Course]], cycle: float) -> dict[str, Any]:
-    gauges = {name: {sim: gait_test.gauge(c, cycle) for sim, c in both.items()} for name, both in walks.items()}
+def _summary(walks: Walks, cycle: float) -> JsonObject:
+    """Return the contents of gait.json."""
+    measured = {
+        condition: {simulator: gait_test.measure_gait(walk, cycle) for simulator, walk in both.items()}
+        for condition, both in walks.items()
+    }
     rows = [
         {
             "velocity": list(velocity),
@@ -87,31 +114,31 @@ def _summary(walks: Mapping[Any, Mapping[str, gait_test.Course]], cycle: float) 
             "c": both["c"].speed,
             "yaw_rate_mjx": both["mjx"].yaw_rate,
             "yaw_rate_c": both["c"].yaw_rate,
-            "drift_deg": max((math.degrees(g.drift) for g in both.values()), key=abs),
+            "drift_deg": max((math.degrees(gait.drift) for gait in both.values()), key=abs),
         }
-        for (velocity, literal), both in gauges.items()
-        if not literal
+        for (velocity, printed_input), both in measured.items()
+        if not printed_input
     ]
-    straight, literal = gauges[STRAIGHT, False]["mjx"], gauges[STRAIGHT, True]
+    straight, printed = measured[Condition(STRAIGHT)]["mjx"], measured[Condition(STRAIGHT, printed_input=True)]
     sway = {f"{name}_deg": math.degrees(getattr(straight, name)) for name in ("pitch", "roll", "yaw")}
     return {
         "cycle_time": cycle,
         "sweep": rows,
-        "literal": {sim: g.speed for sim, g in literal.items()},
+        "literal": {simulator: gait.speed for simulator, gait in printed.items()},
         "sway": sway | {"bounce_mm": 1000 * straight.bounce},
     }
 
 
-def _foot_paths(
-    body: Any, courses: Mapping[Any, Any], walks: Mapping[Any, Mapping[str, gait_test.Course]], cycle: float
-) -> dict[str, Any]:
-    """Cut one cycle of the first leg's foot out of each walk, in the trunk's frame: asked of it, and walked."""
-    geometry, steps = kinematics.geometry(body), round(cycle / gait_test.STEP)
-    asked = {name: np.asarray(kinematics.forward(geometry, course[-steps:]))[:, 0] for name, course in courses.items()}
-    walked = {name: both["mjx"].feet[-steps:, 0] for name, both in walks.items()}
+def _foot_paths(body: mujoco.MjModel, targets: Targets, walks: Walks, cycle: float) -> dict[str, np.ndarray]:
+    """Cut one cycle of the first leg's foot out of each walk, in the trunk's frame: commanded and simulated."""
+    geometry, steps = kinematics.read_geometry(body), round(cycle / gait_test.TIME_STEP)
+    commanded = {
+        condition: np.asarray(kinematics.forward(geometry, own[-steps:]))[:, 0] for condition, own in targets.items()
+    }
+    simulated = {condition: both["mjx"].feet[-steps:, 0] for condition, both in walks.items()}
     return {
-        "velocities": np.array([left for left, _ in DRAWN]),
-        "commanded": np.stack([asked[velocity, False] for velocity in DRAWN]),
-        "simulated": np.stack([walked[velocity, False] for velocity in DRAWN]),
-        "literal": walked[STRAIGHT, True],
+        "velocities": np.array([left for left, _ in PLOTTED_COMMANDS]),
+        "commanded": np.stack([commanded[Condition(velocity)] for velocity in PLOTTED_COMMANDS]),
+        "simulated": np.stack([simulated[Condition(velocity)] for velocity in PLOTTED_COMMANDS]),
+        "literal": simulated[Condition(STRAIGHT, printed_input=True)],
     }

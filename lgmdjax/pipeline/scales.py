@@ -1,13 +1,18 @@
-"""How much of everything: the settings of each stage at the three scales.
+"""Presets of the settings: those of each stage at the three scales, and those of the other studies.
 
-`smoke` goes through every stage in minutes and proves nothing about the robot; `quick` is the smallest that
-shows the result; `paper` uses the paper's figures (15 minutes of the teacher, 1000 epochs of its halves, 235.3 m) and
-more walks, and adds the studies of `lgmdjax.studies`: a stage that a scale has no settings for is left out. A setting
-stands here when the scale or an experiment changes it; physical numbers belong to the components' `Params`.
+| scale | stages                                                                                                     |
+| ----- | ---------------------------------------------------------------------------------------------------------- |
+| smoke | goes through every stage in minutes; its results mean nothing                                              |
+| quick | the smallest that shows the result                                                                         |
+| paper | the paper's sizes (15 minutes of the teacher, 1000 epochs on halves of its walks, 235.3 m) and more walks; |
+|       | also five studies of `lgmdjax.studies`                                                                     |
+
+A stage without settings in a scale is left out. A setting is here if the scale or a study changes it; physical
+constants belong to the components' `Params`. Imports no JAX, so that the command line can.
 """
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 from lgmdjax.evaluation.settings import TrialPlan
 from lgmdjax.learning.settings import LgmdGradientSettings, TrainSettings
@@ -20,34 +25,48 @@ from lgmdjax.studies.settings import (
     FinetuneSettings,
     GaitGradientSettings,
     GradientHorizonSettings,
+    OverlapSettings,
     SensitivitySettings,
     SupervisionSettings,
     VelocitySettings,
 )
 
 Scale = Literal["smoke", "quick", "paper"]
+StageSettings = FitGaitSettings | CollectSettings | TrainSettings | EvaluateSettings | ReportSettings
+StudySettings = (
+    VelocitySettings
+    | SupervisionSettings
+    | ErrataSettings
+    | FailureModesSettings
+    | SensitivitySettings
+    | OverlapSettings
+    | GaitGradientSettings
+    | LgmdGradientSettings
+    | GradientHorizonSettings
+    | FinetuneSettings
+)
 
 _SMALL = CameraSettings(width=64, height=48, pooling=2)
 _QUICK = CameraSettings(width=80, height=60, pooling=3)
-_SMALLER = CameraSettings(width=160, height=120, pooling=6)
+_MEDIUM = CameraSettings(width=160, height=120, pooling=6)
 _PAPER = CameraSettings(width=320, height=240, pooling=12)
 
-SCALES: Mapping[Scale, Mapping[str, Any]] = {
+SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
     "smoke": {
         "fit-gait": FitGaitSettings(steps=300, seconds=6),
         "collect": CollectSettings(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=5),
         "train": TrainSettings(
             eyes=_SMALL,
             epochs=5,
-            rounds=1,
+            dagger_rounds=1,
             round_epochs=5,
             robots=4,
             round_seconds=10,
-            halves_epochs=5,
+            split_half_epochs=5,
             variants=("lstm", "feed-forward", "mean"),
         ),
         "evaluate": EvaluateSettings(
-            places=(
+            trials=(
                 TrialPlan(trial="testing", eyes=_SMALL, seeds=4, seconds=5),
                 TrialPlan(trial="unseen", eyes=_SMALL, seeds=4, seconds=5),
             )
@@ -58,10 +77,10 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "fit-gait": FitGaitSettings(steps=3000, seconds=20),
         "collect": CollectSettings(eyes=_QUICK, robots=16, episodes=2, seconds=45, calibration_seconds=20),
         "train": TrainSettings(
-            eyes=_QUICK, epochs=80, rounds=3, round_epochs=60, robots=16, round_seconds=60, halves_epochs=80
+            eyes=_QUICK, epochs=80, dagger_rounds=3, round_epochs=60, robots=16, round_seconds=60, split_half_epochs=80
         ),
         "evaluate": EvaluateSettings(
-            places=(
+            trials=(
                 TrialPlan(trial="testing", eyes=_QUICK, seeds=16, seconds=20),
                 TrialPlan(trial="unseen", eyes=_QUICK, seeds=16, seconds=70),
             )
@@ -74,15 +93,15 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
         "train": TrainSettings(
             eyes=_QUICK,
             epochs=100,
-            rounds=8,
+            dagger_rounds=8,
             round_epochs=60,
             robots=32,
             round_seconds=120,
-            halves_epochs=1000,
-            cautions=(1.5, 2.0, 2.5, 3.0),
+            split_half_epochs=1000,
+            turn_gains=(1.5, 2.0, 2.5, 3.0),
         ),
         "evaluate": EvaluateSettings(
-            places=(
+            trials=(
                 TrialPlan(trial="testing", eyes=_PAPER, coarse=_QUICK, seeds=5),
                 TrialPlan(trial="unseen", eyes=_QUICK, seeds=64),
                 TrialPlan(trial="tube", eyes=_PAPER, coarse=_QUICK, seeds=8),
@@ -93,25 +112,26 @@ SCALES: Mapping[Scale, Mapping[str, Any]] = {
                 TrialPlan(trial="corner", eyes=_QUICK, seeds=12),
             )
         ),
-        "velocity": VelocitySettings(eyes=_SMALLER, robots=16, metres=1.2),
+        "velocity": VelocitySettings(eyes=_MEDIUM, robots=16, distance=1.2),
         "supervision": SupervisionSettings(
-            bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
-            practice=TrainSettings(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=60),
-            lesson_seconds=30,
+            benchmark=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
+            dagger=TrainSettings(eyes=_QUICK, epochs=80, dagger_rounds=2, round_epochs=60, robots=16, round_seconds=60),
+            demonstration_seconds=30,
             seeds=3,
         ),
-        "errata": ErrataSettings(bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=60)),
-        "failure_modes": FailureModesSettings(bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90)),
+        "errata": ErrataSettings(benchmark=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=60)),
+        "failure_modes": FailureModesSettings(benchmark=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90)),
         "sensitivity": SensitivitySettings(
-            bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=60), epochs=30, seeds=2
+            benchmark=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=60), epochs=30, seeds=2
         ),
         "report": ReportSettings(video_seconds=30),
     },
 }
 
-GRADIENTS: Mapping[str, Any] = {
+STUDY_PRESETS: Mapping[str, StudySettings] = {
+    "overlap": OverlapSettings(robots=8, seeds=4),
     "gradient_horizon": GradientHorizonSettings(eyes=_SMALL, robots=6),
-    # Of 1, 2 and 8 pairs, sigma 0.0003 to 0.02 and rates of 1.25e-3 to 1.5e-2 these serve the evolution strategy best.
+    # The best of the evolution strategy among 1, 2 and 8 pairs, sigma 0.0003 to 0.02, rates of 1.25e-3 to 1.5e-2.
     "gait_gradient": GaitGradientSettings(
         robot_seconds=9000.0,
         window=1.6,
@@ -119,7 +139,7 @@ GRADIENTS: Mapping[str, Any] = {
         clip=1.0,
         pairs=1,
         sigma=1e-3,
-        evolution_rate=2.5e-3,
+        evolution_learning_rate=2.5e-3,
         seeds=3,
     ),
     "lgmd_gradient": LgmdGradientSettings(
@@ -127,17 +147,17 @@ GRADIENTS: Mapping[str, Any] = {
         seconds=28.0,
         epochs=60,
         steps=400,
-        every=25,
+        eval_every=25,
         window=60,
         streams=32,
         learning_rate=1e-2,
-        navigator_rate=1e-3,
+        navigator_learning_rate=1e-3,
         seeds=3,
     ),
     "closed_loop_finetune": FinetuneSettings(
-        bench=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
-        practice=TrainSettings(eyes=_QUICK, epochs=80, rounds=2, round_epochs=60, robots=16, round_seconds=30),
-        lesson_seconds=30,
+        benchmark=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
+        dagger=TrainSettings(eyes=_QUICK, epochs=80, dagger_rounds=2, round_epochs=60, robots=16, round_seconds=30),
+        demonstration_seconds=30,
         window=15,
         horizons=(5, 45),
         learning_rate=1e-2,
@@ -145,4 +165,4 @@ GRADIENTS: Mapping[str, Any] = {
         seeds=3,
     ),
 }
-"""Settings of the studies of gradients through the walk; they are no stages of a run."""
+"""Settings of the studies that are no stages of a run."""

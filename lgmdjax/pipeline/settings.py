@@ -1,4 +1,4 @@
-"""Settings of the stages, beside those of stage train."""
+"""Settings of the stages, beside those of stage train. Imports no JAX, so that the command line can."""
 
 from dataclasses import dataclass
 
@@ -8,32 +8,32 @@ from lgmdjax.sensors.settings import CameraSettings
 
 @dataclass(frozen=True, kw_only=True)
 class FitGaitSettings:
-    """The shaping networks, taught the regular tripod gait, and walked at set velocities."""
+    """Fit of the shaping networks to the regular tripod gait, and walks at set velocities."""
 
-    steps: int
-    seconds: float  # of each measured walk
+    steps: int  # number of optimiser steps
+    seconds: float  # duration of each walk [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class CollectSettings:
-    """Walks of the teacher: as many robots at once, each in a room of its own, and new rooms for every episode."""
+    """Recorded walks of the teacher; every robot has a room of its own, and every episode new rooms."""
 
-    eyes: CameraSettings
-    robots: int
-    episodes: int
-    seconds: float  # of each robot in an episode
-    calibration_seconds: float  # of each robot, walked before to choose the thresholds on
+    eyes: CameraSettings  # the stereo camera
+    robots: int  # number of robots in an episode
+    episodes: int  # number of episodes
+    seconds: float  # duration of each robot's walk in an episode [s]
+    calibration_seconds: float  # duration of each robot's walk for the calibration of the detectors [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateSettings:
-    """The drivers in the paper's experiments, and in rooms that nobody has seen."""
+    """All policies in the paper's experiments, and in held-out rooms."""
 
-    places: tuple[TrialPlan, ...]
+    trials: tuple[TrialPlan, ...]  # the trials, and the settings of each
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportSettings:
-    """The page; the video shows one walk."""
+    """The report page, with a video of one walk."""
 
-    video_seconds: float
+    video_seconds: float  # duration of the video [s]

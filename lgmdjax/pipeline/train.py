@@ -1,19 +1,23 @@
-"""Stage train: fit the navigator, let it walk, label its walks with the rule, and fit again.
+"""Stage train: fit the navigator, roll it out, label its walks with the rule, and fit again (DAgger).
 
-Writes controller.safetensors (with calibration and camera in its header), training.json (fig. 11, table of
-learners), prediction.npz (fig. 12), baselines.npz (what the direct and the random driver need), and the
-navigator's own walks (`lgmdjax.learning.dagger`), a folder a round, from which an interrupted run carries on.
+| file                    | contents                                                                     |
+| ----------------------- | ---------------------------------------------------------------------------- |
+| controller.safetensors  | the navigator, with calibration and camera in its header                     |
+| training.json           | learning curves (fig. 11), and the table of the variants                     |
+| prediction.npz          | fig. 12                                                                      |
+| baselines.npz           | parameters of the policies `direct` and `random`                             |
+| walks/                  | the navigator's own walks (`lgmdjax.learning.dagger`), a folder for each     |
+|                         | round, from which an interrupted run resumes                                 |
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
-from lgmdjax.control import navigator
+from lgmdjax.control import names, navigator
 from lgmdjax.detectors import lgmd
 from lgmdjax.learning import behaviour_cloning, dagger, sequences
 from lgmdjax.learning.settings import TrainSettings
@@ -22,59 +26,75 @@ from lgmdjax.simulation import assembly, episodes
 from lgmdjax.simulation.closed_loop import FRAME_RATE
 from lgmdjax.simulation.episodes import Walk
 
-SHOWN = 60.0  # s, of fig. 12
+PLOT_SECONDS = 60.0  # of fig. 12
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed: int) -> None:
-    """Fit and walk in turns, then fit every variant on all walks, and keep the paper's as the controller."""
+def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed: int) -> None:
+    """Run DAgger, fit every variant to all walks, and save the paper's variant as the controller."""
     recorded = episodes.read(inputs["collect"] / "episodes")
-    header = episodes.parameters(inputs["collect"] / "episodes")
-    np.savez(folder / "baselines.npz", allow_pickle=False, **_baselines(episodes.stretches(recorded)))
+    header = episodes.read_parameters(inputs["collect"] / "episodes")
+    np.savez(folder / "baselines.npz", allow_pickle=False, **_baselines(episodes.segments(recorded)))
     detector = assembly.load_detector(inputs["collect"])
-    robot = assembly.robot(inputs["fit-gait"], settings.eyes, detector, assembly.everyone())
-    whole = dagger.practise(folder, robot, recorded, settings, seed)
-    train, test, unseen = dagger.split(episodes.stretches(whole), seed)
-
-    def fit(name: str, variant: navigator.Variant, train: list[Walk], test: list[Walk]) -> behaviour_cloning.Fit:
-        epochs = settings.halves_epochs if name == "lstm-halves" else settings.epochs
-        epochs = behaviour_cloning.Settings(epochs=epochs if variant != "mean" else 1)
-        start = navigator.create(jax.random.key(seed), variant)
-        return behaviour_cloning.fit(start, train, test, epochs, checkpoints=folder / "checkpoints" / name)
-
-    chosen: list[navigator.Variant] = [name for name in navigator.VARIANTS if name in settings.variants]
-    fits: dict[str, behaviour_cloning.Fit] = {variant: fit(variant, variant, train, test) for variant in chosen}
-    shown = {walk.room for walk in train}
-    # The paper halves every stretch; but a stretch ends where the robot touched something, so that its second half is
-    # what a controller must learn most. One fit to the teacher's walks in halves stands beside.
-    first, second = sequences.halve([walk for walk in episodes.stretches(recorded) if walk.room in shown])
-    fits["lstm-halves"] = fit("lstm-halves", "lstm", first, second)
+    robot = assembly.assemble_robot(inputs["fit-gait"], settings.eyes, detector, assembly.make_policies())
+    walks = dagger.run(folder, robot, recorded, settings, seed)
+    train, test, unseen = dagger.split_rooms(episodes.segments(walks), seed)
+    fits = _fit_variants(folder, train, test, settings, seed)
+    rooms = {segment.room for segment in train}
+    # The paper splits every walk in half. A segment ends where the robot collided, so its second half is what a
+    # controller must learn most. For comparison, one fit uses the halves of the teacher's walks.
+    first, second = sequences.split_halves(
+        [segment for segment in episodes.segments(recorded) if segment.room in rooms]
+    )
+    halves = behaviour_cloning.Settings(epochs=settings.split_half_epochs)
+    fits["lstm-halves"] = behaviour_cloning.fit(
+        navigator.create(jax.random.key(seed), "lstm"), first, second, halves,
+        checkpoints=folder / "checkpoints" / "lstm-halves",
+    )  # fmt: skip
     sets = {"train": train, "test": test, "unseen": unseen}
-    curves = {variant: {"train": fit.train.tolist(), "test": fit.test.tolist()} for variant, fit in fits.items()}
-    minutes = {name: sum(map(len, some)) / FRAME_RATE / 60 for name, some in sets.items()}
-    table = behaviour_cloning.table({variant: fit.best for variant, fit in fits.items()}, sets)
-    lost = sum(not walk.ok[-1] for walk in whole)  # robots that fell, or whose state was not finite
-    learned, cautions = dagger.tempered(folder, robot, fits["lstm"], test, settings, seed)
-    result = {"curves": curves, "table": table, "minutes": minutes, "cautions": cautions, "lost": lost}
+    learned, turn_gains = dagger.select_turn_gain(folder, robot, fits["lstm"], test, settings, seed=seed)
+    result = {
+        "curves": {
+            name: {"train": fit.train_mse.tolist(), "test": fit.test_mse.tolist()} for name, fit in fits.items()
+        },
+        "table": behaviour_cloning.score_variants({name: fit.best for name, fit in fits.items()}, sets),
+        "minutes": {name: sum(map(len, some)) / FRAME_RATE / 60 for name, some in sets.items()},
+        "cautions": turn_gains,
+        "lost": sum(not walk.ok[-1] for walk in walks),  # robots that fell, or whose state was not finite
+    }
     write_json(folder / "training.json", result)
-    # The eyes that it learned with are those of its own walks, most of what it learned from.
+    # The camera is that of the navigator's own walks, which are most of its training data.
     facts = {"eyes": dataclasses.asdict(settings.eyes), "seed": seed, "training": dataclasses.asdict(settings)}
     navigator.save(folder / "controller.safetensors", learned, header | facts)
     np.savez(folder / "prediction.npz", allow_pickle=False, **_prediction(learned, unseen))
 
 
-def _prediction(params: navigator.Params, walks: Sequence[Walk]) -> dict[str, np.ndarray]:
-    """Predict the longest stretch in an unseen room."""
-    walk = max(walks, key=len)[: round(SHOWN * FRAME_RATE)]
+def _fit_variants(
+    folder: Path, train: list[Walk], test: list[Walk], settings: TrainSettings, seed: int
+) -> dict[str, behaviour_cloning.FitResult]:
+    """Fit every variant of the settings to the same segments; "mean" needs one epoch."""
+    fits: dict[str, behaviour_cloning.FitResult] = {}
+    for variant in names.VARIANTS:
+        if variant in settings.variants:
+            fit_settings = behaviour_cloning.Settings(epochs=settings.epochs if variant != "mean" else 1)
+            start = navigator.create(jax.random.key(seed), variant)
+            checkpoints = folder / "checkpoints" / variant
+            fits[variant] = behaviour_cloning.fit(start, train, test, fit_settings, checkpoints=checkpoints)
+    return fits
+
+
+def _prediction(params: navigator.Params, segments: Sequence[Walk]) -> dict[str, np.ndarray]:
+    """Predict the commands of the longest segment in a held-out room (fig. 12)."""
+    walk = max(segments, key=len)[: round(PLOT_SECONDS * FRAME_RATE)]
     series = {name: getattr(walk, name) for name in ("time", "u", "distances", "label")}
     return series | {"predicted": behaviour_cloning.predict(params, [walk])[0]}
 
 
-def _baselines(walks: Sequence[Walk]) -> dict[str, Any]:
-    """Measure the gain that makes u - 0.5 as large as 1/d on the mean, and cut commands of the teacher to replay."""
-    u = np.concatenate([walk.u for walk in walks])
-    nearness = np.concatenate([1 / walk.distances for walk in walks])
-    commands = np.concatenate([walk.label for walk in walks])
+def _baselines(segments: Sequence[Walk]) -> dict[str, np.ndarray | float]:
+    """Return the gain that makes the mean of u - 0.5 equal that of 1/d, and commands of the teacher to replay."""
+    u = np.concatenate([walk.u for walk in segments])
+    proximity = np.concatenate([1 / walk.distances for walk in segments])
+    commands = np.concatenate([walk.label for walk in segments])
     return {
-        "gain": nearness.mean() / max(float((u - lgmd.STILL).mean()), 1e-6),
-        "replayed": np.resize(commands, (assembly.REPLAY, 2)),
+        "gain": proximity.mean() / max(float((u - lgmd.U_AT_REST).mean()), 1e-6),
+        "replayed": np.resize(commands, (assembly.REPLAY_LENGTH, 2)),
     }

@@ -1,15 +1,15 @@
-"""A film of one walk: the robot from outside, what both its eyes see, and u and v running below.
+"""Video of one recorded walk: third-person view of the robot, the images of both its eyes, and curves of u and v.
 
-Everything is drawn again from recorded poses, without OpenGL: room and robot by `lgmdjax.reporting.third_person`, the
-eyes' pictures by `lgmdjax.sensors.camera`, as the robot saw them. A recorded frame is 1/30 s; the film shows every
-fifth of them, twelve a second, which is twice as fast as life.
+All images are rendered from recorded poses, without OpenGL: room and robot by `lgmdjax.reporting.third_person`, the
+eyes' images by `lgmdjax.sensors.camera`, as the robot saw them. A recorded frame is 1/30 s. The video shows every fifth
+frame at twelve images a second, which is twice real speed.
 
-Left is blue and right is orange, as in the report's figures. What an eye's LGMD does not look at, because its
-hemifield ends there, is dimmed.
+Left is blue and right is orange, as in the report's figures. Parts of an eye's image outside the hemifield of its LGMD
+are dimmed.
 """
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -20,34 +20,39 @@ import jax.numpy as jnp
 import matplotlib
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from numpy import ndarray
 from PIL import Image
 from scipy import ndimage
 
+from lgmdjax import geometry
 from lgmdjax.body import hexapod
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import third_person, video_io
-from lgmdjax.reporting.figures.style import FAINT, INK, LEFT, RIGHT, STYLE
+from lgmdjax.reporting.figures.style import DARK, LEFT_COLOUR, LIGHT_GREY, RED, RIGHT_COLOUR, STYLE
+from lgmdjax.reporting.third_person import RobotCapsules, Viewpoint
 from lgmdjax.sensors import camera
-from lgmdjax.simulation.closed_loop import FRAME_RATE
+from lgmdjax.simulation import assembly, closed_loop
+from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena
 
-RATE = 12  # pictures a second
-STRIDE = round(2 * FRAME_RATE / RATE)  # recorded frames from one picture to the next: twice as fast as life
-SIZE = (960, 600)  # px, width and height of the film
-STAGE = (8, 28, 624, 390)  # px: left, top, width, height of the view from outside
-EYES = ((640, 28, 312, 234), (640, 294, 312, 234))
-CURVES = ((58, 444, 574, 50), (58, 520, 574, 50))
-BEHIND, ABOVE, AHEAD = 0.88, 0.58, 0.20  # m, of the camera from the robot, and of the point that it looks at
-DIMMED = 0.45
-CHUNK = 12  # pictures drawn in one call: the memory of the machine, and what two threads share
+VIDEO_RATE = 12  # images per second
+FRAME_STRIDE = round(2 * FRAME_RATE / VIDEO_RATE)  # recorded frames per image: twice real speed
+VIDEO_SIZE = (960, 600)  # px, width and height
+VIEW_BOX = (8, 28, 624, 390)  # px: left, top, width, height of the third-person view
+EYE_BOXES = ((640, 28, 312, 234), (640, 294, 312, 234))  # px, of the left and the right eye's image
+CURVE_BOXES = ((58, 444, 574, 50), (58, 520, 574, 50))  # px, of the curves of u and v
+CAMERA_BEHIND, CAMERA_ABOVE = 0.88, 0.58  # m, position of the third-person camera relative to the robot
+LOOK_AHEAD = 0.20  # m, the camera looks at a point this far ahead of the robot
+DIMMING = 0.45  # brightness outside the hemifield
+IMAGES_PER_CALL = 12  # rendered in one call, which limits memory; two threads share the calls
+Box = tuple[int, int, int, int]  # px: left, top, width, height
 
 
-class Walk(NamedTuple):
-    """One recorded walk, a row a frame of 1/30 s."""
+class WalkTrace(NamedTuple):
+    """Time series of one recorded walk, one row per frame of 1/30 s; the names are those of `Record`."""
 
     time: Float[ndarray, " frames"]  # s
     position: Float[ndarray, "frames 3"]  # m
@@ -58,239 +63,279 @@ class Walk(NamedTuple):
     contact: Bool[ndarray, " frames"]
 
 
-class _Shots(NamedTuple):
-    """What is needed to draw each picture."""
+class BodyGeometry(NamedTuple):
+    """The robot's visible capsules and its eyes in n poses."""
+
+    starts: Float[ndarray, "n capsules 3"]  # m, world
+    ends: Float[ndarray, "n capsules 3"]  # m, world
+    eye_positions: Float[ndarray, "n 2 3"]  # m, world
+    eye_rotations: Float[ndarray, "n 2 3 3"]
+    radii: Float[ndarray, " capsules"]  # m
+    colours: Float[ndarray, "capsules 3"]  # 0..1
+
+
+class _Views(NamedTuple):
+    """Camera, robot and eyes of each image to render."""
 
     time: Array
-    eye: Array  # of the camera outside
-    rotation: Array
+    camera_position: Array  # of the third-person camera
+    camera_rotation: Array
     target: Array
-    starts: Array  # the robot's capsules
+    starts: Array  # of the robot's capsules
     ends: Array
-    positions: Array  # of the robot's own eyes
-    rotations: Array
+    eye_positions: Array
+    eye_rotations: Array
 
 
-def write(
-    target: Path | BinaryIO,
-    walk: Walk,
-    room: arena.Arena,
-    eyes: camera.Params,
+def write_video(
+    path: Path | str,
+    record: Record,
+    room: Room | arena.Arena,
+    robot: closed_loop.Params | None = None,
+    *,
+    index: int | None = None,
     seconds: float = 10.0,
-    overlap: float = 1.0,
-) -> int:
-    """Draw the liveliest stretch of a walk, `seconds` of film, into an MP4 file; give its number of pictures.
+) -> Path:
+    """Write an MP4 video of one walk of a record and return its path.
+
+    The video shows the segment of the walk with the most turning.
 
     Args:
-        target: the file, or something to write bytes to.
-        walk: what the robot did. room: where.
-        eyes: camera parameters for the robot's own pictures, which are drawn in full width.
-        seconds: length of the film; it is shorter if the walk is.
-        overlap: part of the picture's width that each LGMD looks at, for the dimming.
+        path: of the video file.
+        record: recorded walks, axes (robot, frame), or one walk, axis (frame,).
+        room: the rooms of the walks (`lgmdjax.rollout`), or a single room for all of them.
+        robot: the robot that walked, whose camera renders the eyes' images; the pretrained robot by default.
+        index: number of the robot to show; by default the one with the most eventful walk (`most_eventful`).
+        seconds: duration of the video, at twice real speed; it is shorter if the walk is.
+
+    ```python
+    import jax
+    import lgmdjax as lj
+
+    rooms = lj.random_rooms(jax.random.key(0), 4)
+    record = lj.rollout(lj.load_robot(), rooms, seconds=30)
+    lj.write_video("walk.mp4", record, rooms)
+    ```
     """
-    _check(walk)
-    chosen = choose(walk, round(seconds * RATE) * STRIDE)
-    shots, body = _shots(walk, chosen[::STRIDE])
-    paper = _Paper(walk, chosen, (eyes.width, eyes.height))
-    with video_io.writing(target, *SIZE, RATE) as show:
-        for index, (stage, views) in enumerate(_draw(shots, body, room, eyes)):
-            show(paper.picture(stage, views, chosen[index * STRIDE], overlap))
-    return len(shots.time)
+    batch = jax.tree.map(np.asarray, record if np.ndim(record.time) == 2 else jax.tree.map(lambda x: x[None], record))
+    index = most_eventful(batch) if index is None else index
+    if not -len(batch.time) <= index < len(batch.time):
+        raise InputError(f"expected an index of one of {len(batch.time)} walks, got {index}; choose another")
+    scene = room.arena if isinstance(room, Room) else room
+    if np.ndim(scene.bounds) == 2:
+        scene = jax.tree.map(lambda leaf: leaf[index], scene)
+    trace = WalkTrace(*(getattr(batch, name)[index] for name in WalkTrace._fields))
+    write_trace(Path(path), trace, scene, (robot or assembly.load_robot()).camera, seconds)
+    return Path(path)
 
 
-def choose(walk: Walk, frames: int) -> ndarray:
-    """Choose the frames, one after another, with the hardest steering, if possible without a set-back."""
-    total = len(walk.time)
+def most_eventful(record: Record) -> int:
+    """Return the number of the robot with the most turning among those with the fewest collisions; axes (robot, frame).
+
+    Robots that were lost come last.
+    """
+    turning = np.abs(record.velocity[..., 1] - record.velocity[..., 0]).mean(axis=1)
+    return int(np.argmax(turning - 1e3 * record.contact.sum(axis=1) - 1e6 * ~record.ok[:, -1]))
+
+
+def write_trace(
+    target: Path | BinaryIO, trace: WalkTrace, room: arena.Arena, eyes: camera.Params, seconds: float = 10.0
+) -> int:
+    """Write an MP4 video of the segment of a walk with the most turning; return the number of images.
+
+    Args:
+        target: path of the file, or a binary stream.
+        trace: the walk.
+        room: the room of the walk.
+        eyes: camera of the eyes. Images are rendered in full width, and dimmed outside the width that `overlap` gives.
+        seconds: duration of the video; it is shorter if the walk is.
+    """
+    _check(trace)
+    frames = select_segment(trace, round(seconds * VIDEO_RATE) * FRAME_STRIDE)
+    views, robot = _views(trace, frames[::FRAME_STRIDE])
+    page = _Page(trace, frames, (eyes.width, eyes.height))
+    with video_io.open_writer(target, *VIDEO_SIZE, VIDEO_RATE) as write:
+        for index, (view, eye_images) in enumerate(_render(views, robot, room, eyes)):
+            write(page.compose(view, eye_images, frames[index * FRAME_STRIDE], eyes.overlap))
+    return len(views.time)
+
+
+def select_segment(trace: WalkTrace, frames: int) -> Int[ndarray, " frames"]:
+    """Return the consecutive frames with the most turning, if possible without a reset."""
+    total = len(trace.time)
     frames = min(max(frames, 1), total)
-    steering = np.abs(walk.velocity[:, 1] - walk.velocity[:, 0])
-    jumps = np.concatenate([[0.0], jumped(walk.position).astype(float)])
-    sums = np.concatenate([[0.0], np.cumsum(steering - 1e6 * jumps)])
-    # Starts half a second apart are choice enough.
-    starts = np.arange(0, total - frames + 1, 15)
+    turning = np.abs(trace.velocity[:, 1] - trace.velocity[:, 0])
+    resets = np.concatenate([[0.0], detect_resets(trace.position).astype(float)])
+    sums = np.concatenate([[0.0], np.cumsum(turning - 1e6 * resets)])
+    starts = np.arange(0, total - frames + 1, 15)  # every half second
     first = starts[np.argmax(sums[starts + frames] - sums[starts])]
     return np.arange(first, first + frames)
 
 
-def jumped(position: Float[ndarray, "frames 3"]) -> Bool[ndarray, " steps"]:
-    """Tell between which frames the robot was set back: it cannot walk 5 cm in 1/30 s."""
+def detect_resets(position: Float[ndarray, "frames 3"]) -> Bool[ndarray, " steps"]:
+    """Find the steps between frames in which the robot was reset: it can't walk 5 cm in 1/30 s."""
     return np.linalg.norm(np.diff(position, axis=0), axis=1) > 0.05
 
 
-def _check(walk: Walk) -> None:
-    frames = len(walk.time)
+def _check(trace: WalkTrace) -> None:
+    frames = len(trace.time)
     widths = {"position": (3,), "quaternion": (4,), "joints": (6, 3), "u": (2,), "velocity": (2,)}
-    for name, series in walk._asdict().items():
+    for name, series in trace._asdict().items():
         shape = (frames, *widths.get(name, ()))
         if np.shape(series) != shape or not np.all(np.isfinite(series)) or not frames:
             raise InputError(
-                f"expected a walk with finite {name} of shape {shape}, got {np.shape(series)}; "
+                f"expected a walk with finite {name} of shape {shape}, got {np.shape(series)}; choose another walk, or "
                 "delete the run's evaluate folder and run `lgmdjax evaluate`"
             )
 
 
-def _shots(walk: Walk, rows: ndarray) -> tuple[_Shots, third_person.Body]:
-    """Work out where cameras, eyes and limbs are in the chosen frames."""
-    position, heading = _smooth(walk)
+def _views(trace: WalkTrace, rows: Int[ndarray, " n"]) -> tuple[_Views, RobotCapsules]:
+    """Compute the poses of cameras, eyes and limbs in the chosen frames."""
+    position, heading = _smooth(trace)
     forward = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)[rows]
     target = position[rows]
-    eye = target - BEHIND * forward + np.array([0, 0, ABOVE])
-    starts, ends, positions, rotations, radii, colours = bodies(poses(walk, rows))
-    single = partial(jnp.asarray, dtype=jnp.float32)
-    shots = _Shots(
-        *map(
-            single,
-            (
-                walk.time[rows],
-                eye,
-                looking(eye, target + AHEAD * forward),
-                target,
-                starts,
-                ends,
-                positions,
-                rotations,
-            ),
-        )
+    camera_position = target - CAMERA_BEHIND * forward + np.array([0, 0, CAMERA_ABOVE])
+    body = body_geometry(to_qpos(trace, rows))
+    to_single = partial(jnp.asarray, dtype=jnp.float32)
+    views = _Views(
+        time=to_single(trace.time[rows]),
+        camera_position=to_single(camera_position),
+        camera_rotation=to_single(look_at(camera_position, target + LOOK_AHEAD * forward)),
+        target=to_single(target),
+        starts=to_single(body.starts),
+        ends=to_single(body.ends),
+        eye_positions=to_single(body.eye_positions),
+        eye_rotations=to_single(body.eye_rotations),
     )
-    return shots, third_person.Body(shots.starts[0], shots.ends[0], single(radii), single(colours))
+    return views, RobotCapsules(views.starts[0], views.ends[0], to_single(body.radii), to_single(body.colours))
 
 
-def _smooth(walk: Walk) -> tuple[Float[ndarray, "frames 3"], Float[ndarray, " frames"]]:
-    """Average positions over a second and headings over two, for a steady camera; not across a set-back."""
-    w, x, y, z = walk.quaternion.T
-    heading = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    position, cuts = walk.position.copy(), np.flatnonzero(jumped(walk.position)) + 1
-    for piece in np.split(np.arange(len(heading)), cuts):
-        position[piece] = ndimage.uniform_filter1d(walk.position[piece], 31, axis=0, mode="nearest")
-        heading[piece] = ndimage.gaussian_filter1d(heading[piece], 20, mode="nearest")
+def _smooth(trace: WalkTrace) -> tuple[Float[ndarray, "frames 3"], Float[ndarray, " frames"]]:
+    """Smooth positions over a second and headings over two, but not across a reset, for a steady camera."""
+    heading = np.unwrap(geometry.yaw(trace.quaternion))
+    position, starts = trace.position.copy(), np.flatnonzero(detect_resets(trace.position)) + 1
+    for segment in np.split(np.arange(len(heading)), starts):
+        position[segment] = ndimage.uniform_filter1d(trace.position[segment], 31, axis=0, mode="nearest")
+        heading[segment] = ndimage.gaussian_filter1d(heading[segment], 20, mode="nearest")
     return position, heading
 
 
-def looking(eye: Float[ndarray, "n 3"], at: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
-    """Turn cameras so that x looks from `eye` at `at` and y is level to the left."""
+def look_at(eye: Float[ndarray, "n 3"], at: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3 3"]:
+    """Return camera rotations with x from `eye` towards `at` and y level to the left."""
     forward = (at - eye) / np.linalg.norm(at - eye, axis=-1, keepdims=True)
     left = np.cross([0.0, 0.0, 1.0], forward)
     left /= np.linalg.norm(left, axis=-1, keepdims=True)
     return np.stack([forward, left, np.cross(forward, left)], axis=-1)
 
 
-def poses(walk: Walk, rows: ndarray) -> Float[ndarray, "n 25"]:
-    """Put the chosen frames of a walk into the model's coordinates (qpos)."""
-    joints = walk.joints[rows].reshape(len(rows), -1)
-    return np.concatenate([walk.position[rows], walk.quaternion[rows], joints], axis=1)
+def to_qpos(trace: WalkTrace, rows: Int[ndarray, " n"]) -> Float[ndarray, "n 25"]:
+    """Return the chosen frames of a walk in MuJoCo's coordinates (qpos)."""
+    joints = trace.joints[rows].reshape(len(rows), -1)
+    return np.concatenate([trace.position[rows], trace.quaternion[rows], joints], axis=1)
 
 
-def bodies(qpos: Float[ndarray, "n 25"]) -> tuple[ndarray, ...]:
-    """Find the robot's visible capsules and its eyes in so many poses, by C MuJoCo's kinematics.
-
-    Returns:
-        The capsules' two ends (n, k, 3), the eyes' positions (n, 2, 3) and rotations (n, 2, 3, 3); the same
-        for all poses, the radii (k,) and colours (k, 3).
-    """
+def body_geometry(qpos: Float[ndarray, "n 25"]) -> BodyGeometry:
+    """Compute the robot's visible capsules and its eyes in n poses with C MuJoCo's kinematics."""
     model = hexapod.load()
     data = mujoco.MjData(model)
-    seen = np.flatnonzero(model.geom_group == 2)
+    visible = np.flatnonzero(model.geom_group == 2)
     sites = [model.site(name).id for name in hexapod.EYES]
-    half_length = np.where(model.geom_type[seen] == mujoco.mjtGeom.mjGEOM_CAPSULE, model.geom_size[seen, 1], 0.0)
-    found = []
+    is_capsule = model.geom_type[visible] == mujoco.mjtGeom.mjGEOM_CAPSULE
+    half_length = np.where(is_capsule, model.geom_size[visible, 1], 0.0)
+    rows = []
     for pose in qpos:
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
-        reach = data.geom_xmat[seen].reshape(-1, 3, 3)[..., 2] * half_length[:, None]
-        centres, turned = data.geom_xpos[seen], data.site_xmat[sites].reshape(2, 3, 3)
-        found.append((centres - reach, centres + reach, data.site_xpos[sites].copy(), turned.copy()))
-    colours = model.mat_rgba[model.geom_matid[seen], :3]
-    return (*map(np.stack, zip(*found, strict=True)), model.geom_size[seen, 0], colours)
+        half_axis = data.geom_xmat[visible].reshape(-1, 3, 3)[..., 2] * half_length[:, None]
+        centres, rotations = data.geom_xpos[visible], data.site_xmat[sites].reshape(2, 3, 3)
+        rows.append((centres - half_axis, centres + half_axis, data.site_xpos[sites].copy(), rotations.copy()))
+    colours = model.mat_rgba[model.geom_matid[visible], :3]
+    starts, ends, eye_positions, eye_rotations = map(np.stack, zip(*rows, strict=True))
+    return BodyGeometry(starts, ends, eye_positions, eye_rotations, model.geom_size[visible, 0], colours)
 
 
-def _draw(
-    shots: _Shots, body: third_person.Body, room: arena.Arena, eyes: camera.Params
-) -> Iterator[tuple[ndarray, ndarray]]:
-    """Draw the shots in chunks of one size, two chunks at a time; the last is filled up and cut."""
-    count = len(shots.time)
-    draw = _drawer(third_person.Params(), eyes.replace(overlap=1.0))  # pyright: ignore[reportAttributeAccessIssue]
+def _render(
+    views: _Views, robot: RobotCapsules, room: arena.Arena, eyes: camera.Params
+) -> Iterator[tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "2 rows columns"]]]:
+    """Render the views in chunks of one size, two at a time; the last chunk is padded."""
+    count = len(views.time)
+    render = _renderer(third_person.Params(), eyes.replace(overlap=1.0))  # pyright: ignore[reportAttributeAccessIssue]
     room = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), room)
 
-    def chunk(first: int) -> tuple[ndarray, ndarray]:
-        rows = np.minimum(np.arange(first, first + CHUNK), count - 1)
-        stage, views = draw(jax.tree.map(lambda leaf: leaf[rows], shots), body, room)
-        return np.asarray(stage)[: count - first], np.asarray(views)[: count - first]
+    def render_chunk(first: int) -> tuple[ndarray, ndarray]:
+        rows = np.minimum(np.arange(first, first + IMAGES_PER_CALL), count - 1)
+        view, eye_images = render(jax.tree.map(lambda leaf: leaf[rows], views), robot, room)
+        return np.asarray(view)[: count - first], np.asarray(eye_images)[: count - first]
 
     with ThreadPoolExecutor(2) as pool:
-        for stage, views in pool.map(chunk, range(0, count, CHUNK)):
-            yield from zip(stage, views, strict=True)
+        for view, eye_images in pool.map(render_chunk, range(0, count, IMAGES_PER_CALL)):
+            yield from zip(view, eye_images, strict=True)
 
 
-def _drawer(view: third_person.Params, eyes: camera.Params):
-    """Compile the drawing of a chunk: pictures from outside (n, h, w, 3) and of both eyes (n, 2, h, w)."""
+def _renderer(
+    params: third_person.Params, eyes: camera.Params
+) -> Callable[[_Views, RobotCapsules, arena.Arena], tuple[Array, Array]]:
+    """Compile the rendering of a chunk: third-person images (n, h, w, 3) and images of both eyes (n, 2, h, w)."""
 
-    def one(body: third_person.Body, room: arena.Arena, shot: _Shots) -> tuple[Array, Array]:
-        scene = arena.at(room, shot.time)
-        robot = body._replace(starts=shot.starts, ends=shot.ends)
-        stage = third_person.picture(view, scene, shot.eye, shot.rotation, robot, shot.target)
-        views = camera.render(eyes, scene, shot.positions, shot.rotations)
-        return (255 * stage).astype(jnp.uint8), jnp.clip(views, 0, 255).astype(jnp.uint8)
+    def render(robot: RobotCapsules, room: arena.Arena, view: _Views) -> tuple[Array, Array]:
+        scene = arena.at_time(room, view.time)
+        posed = robot._replace(starts=view.starts, ends=view.ends)
+        viewpoint = Viewpoint(view.camera_position, view.camera_rotation)
+        image = third_person.render_view(params, scene, viewpoint, posed, view.target)
+        eye_images = camera.render(eyes, scene, view.eye_positions, view.eye_rotations)
+        return (255 * image).astype(jnp.uint8), jnp.clip(eye_images, 0, 255).astype(jnp.uint8)
 
-    return jax.jit(lambda shots, body, room: jax.lax.map(partial(one, body, room), shots))
+    return jax.jit(lambda views, robot, room: jax.lax.map(partial(render, robot, room), views))
 
 
-class _Paper:
-    """The film's page: drawn once by matplotlib, with and without its curves, then only cut and pasted."""
+class _Page:
+    """The page of the video: plotted once with and once without its curves, then composed with each image."""
 
-    def __init__(self, walk: Walk, chosen: ndarray, pixels: tuple[int, int]) -> None:
-        time = walk.time[chosen]
-        self.contact = ndimage.maximum_filter1d(walk.contact.astype(float), 2 * STRIDE) > 0
-        series = walk.u[chosen], walk.velocity[chosen]
-        self.blank, _ = _page(time, series, pixels, curves=False)
-        self.full, columns = _page(time, series, pixels, curves=True)
-        self.column = dict(zip(chosen.tolist(), np.round(columns).astype(int).tolist(), strict=True))
+    def __init__(self, trace: WalkTrace, frames: Int[ndarray, " n"], eye_size: tuple[int, int]) -> None:
+        time = trace.time[frames]
+        self.contact = ndimage.maximum_filter1d(trace.contact.astype(float), 2 * FRAME_STRIDE) > 0
+        series = trace.u[frames], trace.velocity[frames]
+        self.blank, _ = _plot_page(time, series, eye_size, curves=False)
+        self.full, columns = _plot_page(time, series, eye_size, curves=True)
+        self.column = dict(zip(frames.tolist(), np.round(columns).astype(int).tolist(), strict=True))
 
-    def picture(
-        self,
-        stage: UInt8[ndarray, "h w 3"],
-        views: UInt8[ndarray, "2 rows columns"],
-        frame: int,
-        overlap: float,
+    def compose(
+        self, view: UInt8[ndarray, "h w 3"], eye_images: UInt8[ndarray, "2 rows columns"], frame: int, overlap: float
     ) -> UInt8[ndarray, "height width 3"]:
-        """Put one picture of the film together."""
-        page, now, top = self.blank.copy(), self.column[frame], CURVES[0][1] - 8
+        """Compose one image of the video: views, and curves up to the frame; red border around a contact."""
+        page, now, top = self.blank.copy(), self.column[frame], CURVE_BOXES[0][1] - 8
         page[top:, :now] = self.full[top:, :now]
-        bottom = CURVES[1][1] + CURVES[1][3]
-        page[CURVES[0][1] : bottom, now - 1 : now + 1] = _rgb(INK)
-        _paste(page, stage, STAGE, "#c1121f" if self.contact[frame] else None)
-        for side, (view, place, colour) in enumerate(zip(views, EYES, (LEFT, RIGHT), strict=True)):
-            lit = np.arange(view.shape[1]) < overlap * view.shape[1]
-            lit = lit if side == 0 else lit[::-1]
-            shown = (view * np.where(lit, 1.0, DIMMED)).astype(np.uint8)
-            _paste(page, np.repeat(shown[..., None], 3, axis=-1), place, colour)
+        bottom = CURVE_BOXES[1][1] + CURVE_BOXES[1][3]
+        page[CURVE_BOXES[0][1] : bottom, now - 1 : now + 1] = _rgb(DARK)
+        _paste(page, view, VIEW_BOX, RED if self.contact[frame] else None)
+        for side, (image, box, colour) in enumerate(
+            zip(eye_images, EYE_BOXES, (LEFT_COLOUR, RIGHT_COLOUR), strict=True)
+        ):
+            in_hemifield = np.arange(image.shape[1]) < overlap * image.shape[1]
+            in_hemifield = in_hemifield if side == 0 else in_hemifield[::-1]
+            dimmed = (image * np.where(in_hemifield, 1.0, DIMMING)).astype(np.uint8)
+            _paste(page, np.repeat(dimmed[..., None], 3, axis=-1), box, colour)
         return page
 
 
-def _page(
-    time: ndarray, series: tuple[ndarray, ndarray], pixels: tuple[int, int], *, curves: bool
+def _plot_page(
+    time: ndarray, series: tuple[ndarray, ndarray], eye_size: tuple[int, int], *, curves: bool
 ) -> tuple[UInt8[ndarray, "h w 3"], ndarray]:
-    """Draw titles, axes and, if wanted, the curves of u and v; give the page and the column of each time."""
+    """Plot titles, axes and optionally the curves of u and v; return the page and the column [px] of each time."""
     with matplotlib.rc_context({**STYLE, "figure.constrained_layout.use": False}):
-        figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100)
-        size = f"{pixels[0]} × {pixels[1]} pixels"
-        for place, title in (
-            (STAGE, "the robot from outside, at twice its speed"),
-            (EYES[0], f"left eye, {size}"),
-            (EYES[1], f"right eye, {size}"),
-        ):
-            _write(figure, place[0], place[1] - 7, title)
-        for index, line in enumerate(("Dimmed: not in the hemifield of this", "eye's collision detector.")):
-            _write(figure, EYES[1][0], 552 + 18 * index, line, color="#555555")
-        axes = [figure.add_axes(_fraction(place)) for place in CURVES]
-        # u seldom leaves the lower part of its range; the axis goes as far as it does.
+        figure = Figure(figsize=(VIDEO_SIZE[0] / 100, VIDEO_SIZE[1] / 100), dpi=100)
+        _add_titles(figure, f"{eye_size[0]} × {eye_size[1]} pixels")
+        axes = [figure.add_axes(_fraction(box)) for box in CURVE_BOXES]
+        # u is mostly in the lower part of its range; the axis ends at its maximum.
         top = max(0.6, 0.5 + 1.1 * (float(series[0].max()) - 0.5))
         axes[0].set(ylim=(0.5 - 0.05 * (top - 0.5), top), title="LGMD outputs u", xticklabels=[])
         axes[1].set(ylim=(-1.15, 2.15), yticks=(-1, 0, 1, 2))
         axes[1].set_title("commanded velocities v [0.05 m/s], over time [s]")
         for panel, both in zip(axes, series, strict=True):
             panel.set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1)
-            panel.spines[:].set_color(FAINT)
+            panel.spines[:].set_color(LIGHT_GREY)
             panel.title.set_fontsize(8.5)
-            for side, colour in enumerate((LEFT, RIGHT) if curves else ()):
+            for side, colour in enumerate((LEFT_COLOUR, RIGHT_COLOUR) if curves else ()):
                 panel.plot(time, both[:, side], color=colour, linewidth=1.3)
         axes[0].locator_params(axis="y", nbins=3)
         buffer = io.BytesIO()
@@ -299,22 +344,31 @@ def _page(
     return np.asarray(Image.open(buffer).convert("RGB")).copy(), columns
 
 
-def _write(figure: Figure, x: int, y: int, text: str, **style) -> None:
-    figure.text(x / SIZE[0], 1 - y / SIZE[1], text, va="baseline", fontsize=9.5, **style)
+def _add_titles(figure: Figure, eye_size: str) -> None:
+    titles = "third-person view, at twice real speed", f"left eye, {eye_size}", f"right eye, {eye_size}"
+    for box, title in zip((VIEW_BOX, *EYE_BOXES), titles, strict=True):
+        _add_text(figure, box[0], box[1] - 7, title)
+    for index, line in enumerate(("Dimmed: outside the hemifield of this", "eye's collision detector.")):
+        _add_text(figure, EYE_BOXES[1][0], 552 + 18 * index, line, color="#555555")
 
 
-def _fraction(place: tuple[int, int, int, int]) -> tuple[float, float, float, float]:
-    x, y, width, height = place
-    return x / SIZE[0], 1 - (y + height) / SIZE[1], width / SIZE[0], height / SIZE[1]
+def _add_text(figure: Figure, x: int, y: int, text: str, *, color: str = DARK) -> None:
+    figure.text(x / VIDEO_SIZE[0], 1 - y / VIDEO_SIZE[1], text, va="baseline", fontsize=9.5, color=color)
 
 
-def _paste(page: ndarray, picture: ndarray, place: tuple[int, int, int, int], frame: str | None) -> None:
-    """Put a picture in its place, scaled to fit, with a coloured frame around it if wanted."""
-    x, y, width, height = place
-    if frame:
-        page[y - 3 : y + height + 3, x - 3 : x + width + 3] = _rgb(frame)
+def _fraction(box: Box) -> tuple[float, float, float, float]:
+    """Convert a box in pixels into matplotlib's fractions of the figure."""
+    x, y, width, height = box
+    return x / VIDEO_SIZE[0], 1 - (y + height) / VIDEO_SIZE[1], width / VIDEO_SIZE[0], height / VIDEO_SIZE[1]
+
+
+def _paste(page: ndarray, image: ndarray, box: Box, border: str | None) -> None:
+    """Paste an image into its box, scaled to fit, optionally with a coloured border."""
+    x, y, width, height = box
+    if border:
+        page[y - 3 : y + height + 3, x - 3 : x + width + 3] = _rgb(border)
     page[y : y + height, x : x + width] = np.asarray(
-        Image.fromarray(picture).resize((width, height), Image.Resampling.BICUBIC)
+        Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC)
     )
 
 

@@ -1,26 +1,26 @@
-"""Compiled programs, of which a process can hold only so many.
+"""Release compiled programs before a process holds too many of them.
 
-The code of a walk is mapped in thousands of pieces, and Linux allows a process 65530 of them: about ten walks' worth.
-The eleventh does not compile ("Unable to allocate section memory").
+XLA maps the code of one rollout program in thousands of pieces, and Linux allows a process 65530 mappings, which about
+ten such programs exhaust. The next one fails to compile ("Unable to allocate section memory").
 """
 
 from pathlib import Path
 
 import jax
 
-MAPPED, ALLOWED = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-SHARE = 0.2  # room for as much again, four times
+MAPS_FILE, LIMIT_FILE = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+CROWDED_FRACTION = 0.2  # leaves room for four times as much before the next call
 
 
-def let_go(share: float = SHARE) -> None:
-    """Let go of all compiled programs if they fill more than a share of what is allowed; where there is a bound.
+def clear_caches_if_crowded(fraction: float = CROWDED_FRACTION) -> None:
+    """Clear JAX's caches in memory if this process uses more than a fraction of the mappings that Linux allows it.
 
-    They are compiled anew, or read back from JAX's cache on disk, when they are called again: call this between parts
-    of a long work that have programs of their own.
+    Do nothing on systems without such a limit. Cleared programs are compiled again, or read from JAX's cache on disk,
+    when they are called next. Call this between parts of a long computation that compile programs of their own.
     """
-    if not (MAPPED.exists() and ALLOWED.exists()):
+    if not (MAPS_FILE.exists() and LIMIT_FILE.exists()):
         return
-    with MAPPED.open("rb") as lines:
-        mapped = sum(1 for _ in lines)
-    if mapped > share * int(ALLOWED.read_text()):
+    with MAPS_FILE.open("rb") as lines:
+        mappings = sum(1 for _ in lines)
+    if mappings > fraction * int(LIMIT_FILE.read_text()):
         jax.clear_caches()

@@ -1,12 +1,18 @@
-"""Run folders: a stage is done once, carries on after an interruption, and never leaves half a result.
+"""Run folders: a stage runs once, resumes after an interruption, and never leaves half a result.
 
-    runs/<name>/run.json                   scale, seed, settings and versions that the run was made with
-    runs/<name>/<stage>.partial-<print>/   while the stage works; stays when interrupted, to carry on from
-    runs/<name>/<stage>/                   its files, moved here in one step once all of them are written
-    runs/<name>/<stage>/done.json          its fingerprint, files, seconds of the last try, versions, device
+| path                                       | content                                                          |
+| ------------------------------------------ | ---------------------------------------------------------------- |
+| runs/<name>/run.json                       | format, scale, seed, settings and versions of the run            |
+| runs/<name>/<stage>.partial-<fingerprint>/ | files of a stage that is running, or was interrupted             |
+| runs/<name>/<stage>/                       | files of a finished stage, moved here in one step                |
+| runs/<name>/<stage>/done.json              | fingerprint, files, seconds of the last run, versions, device    |
+| runs/<name>/.lock                          | locked by the process that runs stages                           |
 
-The fingerprint of a stage covers its settings, the seed, the versions of its format and of lgmdjax, and the
-fingerprints of its inputs: a stage whose folder carries the fingerprint that it would get now has nothing to do.
+A stage's fingerprint covers its settings, the seed, the versions of its format and of lgmdjax, and the fingerprints of
+its inputs. A stage whose folder carries the fingerprint that it would get now is up to date.
+
+Folders of format 1 (version 0.1.0) named some settings otherwise. Their robots can be loaded; their stages cannot be
+resumed.
 """
 
 import contextlib
@@ -26,194 +32,221 @@ from filelock import FileLock, Timeout
 
 from lgmdjax import __version__
 from lgmdjax.errors import InputError
-from lgmdjax.runtime import compiled_code, versions
-from lgmdjax.runtime.storage import write_json
+from lgmdjax.runtime import compiled_code, storage, versions
+from lgmdjax.runtime.storage import JsonObject
 
-FORMAT = 1  # of the run folder; a change makes every stage of an older folder run again
-SEEDS = 2**32  # in single precision JAX keeps no more of a seed: greater ones would be other ones' twins
+FORMAT = 2  # of the run folder; no stage is resumed in a folder of another format
+SEED_LIMIT = 2**32  # in single precision JAX keeps the last 32 bits of a seed: greater seeds would repeat smaller ones
 
-# Writes its files into the folder (first argument), which may hold what an interrupted try left there; reads
-# the finished folders of its input stages, by their names; gets its own settings and the run's seed.
-Work = Callable[[Path, Mapping[str, Path], Any, int], None]
+StageFunction = Callable[[Path, Mapping[str, Path], Any, int], None]
+"""Function of a stage: `run(folder, inputs, settings, seed)`.
+
+It writes its files into `folder`, which may hold those of an interrupted run, and reads the finished folders of its
+input stages, by name.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """One step of the pipeline; raise `version` when the files it writes change their meaning."""
+    """A step of the pipeline."""
 
     name: str
-    work: Work
-    inputs: tuple[str, ...] = ()
-    version: int = 1
+    run: StageFunction
+    inputs: tuple[str, ...] = ()  # names of stages
+    version: int = 1  # raise it when the files of the stage change their meaning
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """One run folder, and the settings of each stage (frozen dataclasses) by the stage's name."""
+    """A run folder, and the settings (frozen dataclasses) of its stages by name."""
 
     folder: Path
     seed: int
-    settings: Mapping[str, Any]
+    settings: Mapping[str, object]
 
 
-def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str, Any]) -> Run:
-    """Make the run folder out/name, or take up the one that is there.
+def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str, object]) -> Run:
+    """Open the run folder out/name, or make it.
 
-    Raises InputError when the folder cannot be written, or was made with another scale, seed or settings.
+    Raises `InputError` for a folder that cannot be written, or that was made with another scale, seed or settings.
     """
     if name in ("", ".", "..") or Path(name).name != name:
         raise InputError(f"expected a plain folder name for the run, got {name!r}; use --out for the path")
-    if not 0 <= seed < SEEDS:
-        raise InputError(f"expected a seed of 0 to {SEEDS - 1}, got {seed}; choose another --seed")
+    if not 0 <= seed < SEED_LIMIT:
+        raise InputError(f"expected a seed of 0 to {SEED_LIMIT - 1}, got {seed}; choose another --seed")
     folder = out / name
-    asked = {"format": FORMAT, "scale": scale, "seed": seed, "settings": _plain(settings)}
+    requested = {"format": FORMAT, "scale": scale, "seed": seed, "settings": _to_json(settings)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / "run.json").exists():
-            _check_same(folder, asked)
+            _check_same(folder, requested)
         else:
-            write_json(folder / "run.json", asked | {"versions": versions.installed()})
+            storage.write_json(folder / "run.json", requested | {"versions": versions.installed()})
         (folder / ".lock").touch()
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(
-            f"expected a folder that can be written, got {folder} ({reason}); choose another --out"
-        ) from error
+        raise storage.not_writable(folder, error) from error
     return Run(folder=folder, seed=seed, settings=settings)
 
 
 def execute(run: Run, stages: Sequence[Stage], target: str) -> Path:
-    """Bring a stage and everything it is made from up to date; give the folder of its files.
+    """Run the stages that `target` needs and that are not up to date, then `target`; return its folder.
 
-    Raises InputError when another process is at work in the same run folder.
+    Stages without settings in this run are left out, also as inputs of others. Raises `InputError` if another process
+    is running stages in the same folder.
+
+    Args:
+        run: from `open_run`.
+        stages: in the order of the pipeline, inputs first.
+        target: name of a stage.
     """
     stages = [
         dataclasses.replace(stage, inputs=tuple(name for name in stage.inputs if name in run.settings))
         for stage in stages
         if stage.name in run.settings
     ]
-    by_name = {stage.name: stage for stage in stages}
-    needed = _with_inputs(by_name, target)
-    prints: dict[str, str] = {}
-    with _alone(run.folder):
-        for stage in stages:  # in the order of the pipeline, inputs first
-            if stage.name in needed:
-                prints[stage.name] = fingerprint(stage, run.settings[stage.name], run.seed, prints)
-                _do(run, stage, prints[stage.name])
+    required = _required_stages({stage.name: stage for stage in stages}, target)
+    fingerprints: dict[str, str] = {}
+    with _locked(run.folder):
+        for stage in stages:
+            if stage.name in required:
+                settings = run.settings[stage.name]
+                fingerprints[stage.name] = fingerprint(stage, settings, run.seed, fingerprints)
+                _update(run, stage, fingerprints[stage.name])
     return run.folder / target
 
 
-def fingerprint(stage: Stage, settings: Any, seed: int, inputs: Mapping[str, str]) -> str:
-    """Hash all that the files of a stage depend on."""
+def fingerprint(stage: Stage, settings: object, seed: int, inputs: Mapping[str, str]) -> str:
+    """Return a hash of everything that the files of a stage depend on; `inputs` has the stages' fingerprints."""
     facts = {
         "format": FORMAT,
         "stage": stage.name,
         "version": stage.version,
         "lgmdjax": __version__,
-        "settings": _plain(settings),
+        "settings": _to_json(settings),
         "seed": seed,
         "inputs": {name: inputs[name] for name in stage.inputs},
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _do(run: Run, stage: Stage, print_: str) -> None:
-    """Run one stage unless it is done."""
+def describe_devices() -> str:
+    """Name the devices that JAX computes on."""
+    devices = jax.devices()
+    kind = devices[0].device_kind if devices[0].platform != "cpu" else f"cpu, {os.cpu_count()} cores"
+    return kind if len(devices) == 1 else f"{len(devices)} x {kind}"
+
+
+def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
+    """Run one stage unless it is up to date."""
     final = run.folder / stage.name
-    if _is_done(final, print_):
+    if _is_done(final, stage_fingerprint):
         print(f"{stage.name}: up to date in {final}", flush=True)
         return
-    partial = run.folder / f"{stage.name}.partial-{print_}"
-    if not _is_done(partial, print_):  # a kill may have come between the last file and the move
-        for stale in set(run.folder.glob(f"{stage.name}.partial-*")) - {partial}:
-            shutil.rmtree(stale)
-        _announce(stage, final, run.seed, resumed=partial.exists())
-        partial.mkdir(exist_ok=True)
-        began = time.perf_counter()
-        inputs = {name: run.folder / name for name in stage.inputs}
-        stage.work(partial, inputs, run.settings[stage.name], run.seed)
-        seconds = time.perf_counter() - began
-        compiled_code.let_go()
-        stamp = {"fingerprint": print_, "seconds": round(seconds, 1), "versions": versions.installed()}
-        write_json(partial / "done.json", stamp | {"device": device(), "files": _sizes(partial)})
+    partial = run.folder / f"{stage.name}.partial-{stage_fingerprint}"
+    if not _is_done(partial, stage_fingerprint):  # done if the process was killed right before the move below
+        for outdated in set(run.folder.glob(f"{stage.name}.partial-*")) - {partial}:
+            shutil.rmtree(outdated)
+        _print_start(stage, final, run.seed, resumed=partial.exists())
+        seconds = _run_in(partial, run, stage, stage_fingerprint)
         print(f"{stage.name}: done in {seconds:.0f} s", flush=True)
     if final.exists():
         shutil.rmtree(final)
     os.replace(partial, final)
 
 
-def device() -> str:
-    """Describe what the arrays live on."""
-    devices = jax.devices()
-    kind = devices[0].device_kind if devices[0].platform != "cpu" else f"cpu, {os.cpu_count()} cores"
-    return kind if len(devices) == 1 else f"{len(devices)} x {kind}"
+def _run_in(folder: Path, run: Run, stage: Stage, stage_fingerprint: str) -> float:
+    """Run a stage in a folder, which may hold files of an interrupted run; return the seconds that it took."""
+    folder.mkdir(exist_ok=True)
+    storage.remove_partial_files(folder)
+    start = time.perf_counter()
+    inputs = {name: run.folder / name for name in stage.inputs}
+    stage.run(folder, inputs, run.settings[stage.name], run.seed)
+    seconds = time.perf_counter() - start
+    compiled_code.clear_caches_if_crowded()
+    stamp = {"fingerprint": stage_fingerprint, "seconds": round(seconds, 1), "versions": versions.installed()}
+    storage.write_json(folder / "done.json", stamp | {"device": describe_devices(), "files": _file_sizes(folder)})
+    return seconds
 
 
-def _announce(stage: Stage, final: Path, seed: int, *, resumed: bool) -> None:
-    found = versions.installed()
-    words = ", ".join(f"{name} {found[name]}" for name in ("lgmdjax", "python", "jax", "mujoco"))
-    verb = "carries on" if resumed else "starts"
-    print(f"{stage.name}: {verb} on {device()}; {words}; seed {seed}; into {final}", flush=True)
+def _print_start(stage: Stage, final: Path, seed: int, *, resumed: bool) -> None:
+    installed = versions.installed()
+    packages = ", ".join(f"{name} {installed[name]}" for name in ("lgmdjax", "python", "jax", "mujoco"))
+    verb = "resumes" if resumed else "starts"
+    print(f"{stage.name}: {verb} on {describe_devices()}; {packages}; seed {seed}; into {final}", flush=True)
 
 
-def _is_done(folder: Path, print_: str) -> bool:
+def _is_done(folder: Path, stage_fingerprint: str) -> bool:
+    """Tell whether a folder holds all files of a stage that finished with this fingerprint."""
     try:
         stamp = json.loads((folder / "done.json").read_text())
-        return stamp["fingerprint"] == print_ and stamp["files"].items() <= _sizes(folder).items()
+        return stamp["fingerprint"] == stage_fingerprint and stamp["files"].items() <= _file_sizes(folder).items()
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return False  # no stamp that can be read: do it again
+        return False  # the stamp is missing or damaged, so the stage runs again
 
 
-def _sizes(folder: Path) -> dict[str, int]:
+def _file_sizes(folder: Path) -> dict[str, int]:
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "done.json")
     return {str(path.relative_to(folder)): path.stat().st_size for path in files}
 
 
-def _with_inputs(stages: Mapping[str, Stage], target: str) -> set[str]:
-    return {target}.union(*(_with_inputs(stages, name) for name in stages[target].inputs))
+def _required_stages(stages: Mapping[str, Stage], target: str) -> set[str]:
+    """Return the names of `target` and of all stages that it depends on."""
+    return {target}.union(*(_required_stages(stages, name) for name in stages[target].inputs))
 
 
-def _plain(settings: Any) -> Any:
-    """Turn nested dataclasses into what JSON gives back, so that the two compare equal."""
+def _to_json(settings: object) -> object:
+    """Convert nested dataclasses to what reading them back from JSON gives."""
     if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
         settings = dataclasses.asdict(settings)
     if isinstance(settings, Mapping):
-        return {key: _plain(value) for key, value in settings.items()}
+        return {key: _to_json(value) for key, value in settings.items()}
     return json.loads(json.dumps(settings))
 
 
-def _check_same(folder: Path, asked: dict[str, Any]) -> None:
+def _check_same(folder: Path, requested: JsonObject) -> None:
+    """Raise `InputError` unless a run folder was made in this format with the requested scale, seed and settings."""
     try:
-        made = json.loads((folder / "run.json").read_text())
-        differing = _first_difference({key: made[key] for key in asked}, asked)
+        recorded = json.loads((folder / "run.json").read_text())
+        maker = None if recorded["format"] == FORMAT else "a newer" if recorded["format"] > FORMAT else "an older"
+        difference = None if maker else _first_difference({key: recorded[key] for key in requested}, requested)
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"expected the settings of a run in {folder / 'run.json'}, got a file that cannot be read; "
             "choose another --name, or delete the folder"
         ) from error
-    if differing:
-        key, had, wants = differing
+    if maker:
         raise InputError(
-            f"expected a run folder made with {key} = {wants}, got {folder} made with {had}; "
+            f"expected a run folder of format {FORMAT}, got {folder} of format {recorded['format']}, made by {maker} "
+            "lgmdjax; its robot can still be used with --run; choose another --name to run the stages"
+        )
+    if difference:
+        key, found, expected = difference
+        raise InputError(
+            f"expected a run folder made with {key} = {expected}, got {folder} made with {found}; "
             "choose another --name or --out, or delete the folder"
         )
 
 
-def _first_difference(had: Any, wants: Any, key: str = "") -> tuple[str, Any, Any] | None:
-    if isinstance(had, dict) and isinstance(wants, dict) and had.keys() == wants.keys():
-        inner = (_first_difference(had[k], wants[k], f"{key}.{k}".lstrip(".")) for k in wants)
-        return next((found for found in inner if found), None)
-    return None if had == wants else (key, had, wants)
+def _first_difference(found: object, expected: object, key: str = "") -> tuple[str, object, object] | None:
+    """Return the path and the two values of the first setting that differs; None if none does."""
+    if isinstance(found, dict) and isinstance(expected, dict) and found.keys() == expected.keys():
+        parts = [(name, found[name], expected[name]) for name in expected]
+    elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
+        parts = [(index, *pair) for index, pair in enumerate(zip(found, expected, strict=True))]
+    else:
+        return None if found == expected else (key, found, expected)
+    differences = (_first_difference(one, other, f"{key}.{name}".lstrip(".")) for name, one, other in parts)
+    return next((difference for difference in differences if difference), None)
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the run folder for this process; the system lets go of it however the process ends."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a run folder; the operating system releases it however the process ends."""
     try:
-        held = FileLock(folder / ".lock").acquire(blocking=False)
+        lock = FileLock(folder / ".lock").acquire(blocking=False)
     except Timeout as error:
         raise InputError(
-            f"expected {folder} to be free, got a run at work in it; wait, or choose another --name"
+            f"expected {folder} to be unused, got one where another process runs stages; wait, or choose another --name"
         ) from error
-    with held:
+    with lock:
         yield

@@ -1,4 +1,4 @@
-"""The versions that a result depends on, as they stand in every file that is meant to be kept."""
+"""Versions of the packages that results depend on; every file meant to be kept records them."""
 
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -9,7 +9,12 @@ PACKAGES = ("jax", "jaxlib", "flax", "mujoco", "mujoco-mjx", "numpy", "pyarrow")
 
 
 def installed() -> dict[str, str]:
-    """Name what is installed; 'missing' where a package is not."""
+    """Return the installed versions by package, with Python's own; "missing" for a package that is not installed.
+
+    >>> from lgmdjax.runtime import versions
+    >>> sorted(versions.installed())[:4]
+    ['flax', 'jax', 'jaxlib', 'lgmdjax']
+    """
     found = {"python": sys.version.split()[0], "lgmdjax": __version__}
     for package in PACKAGES:
         try:

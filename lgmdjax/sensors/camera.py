@@ -1,8 +1,9 @@
-"""Two fisheye eyes: what the robot sees, every pixel integrated over its area.
+"""Stereo fisheye camera: images of the left and the right eye, each pixel integrated over its area.
 
-One ray a pixel, and beside it how the ray turns from pixel to pixel. What a surface covers of a pixel follows from
-the margin by which the ray is inside its outline: no sampling, and differentiable everywhere (`layers`). Prisms are
-sorted out by image tile, each of which knows the `slots` nearest ones that may show in it.
+The camera casts one ray per pixel and knows how the ray changes from pixel to pixel. The part of a pixel that a surface
+covers follows from the margin by which the ray is inside the surface's outline. This needs no sampling and is
+differentiable everywhere (`compositing`). Prisms are culled by image tile: each tile keeps the `tile_capacity` nearest
+ones that may be visible in it.
 
 | symbol   | name                                   | unit   | where                                        |
 | -------- | -------------------------------------- | ------ | -------------------------------------------- |
@@ -12,8 +13,8 @@ sorted out by image tile, each of which knows the `slots` nearest ones that may 
 | d        | direction of a pixel                   | 1      |                                              |
 | d_u, d_v | its derivatives                        | 1/px   |                                              |
 
-Site frames: x forward, y left, z up. Row 0 is the top, column 0 the left. Grey levels 0..255.
-Source: sec. 3.1 and 4 of the paper for the cameras; the way of drawing is our own.
+Frames of the eyes: x forward, y left, z up. Row 0 is the top, column 0 the left. Grey levels 0..255.
+Source: sec. 3.1 and 4 of the paper for the cameras; the rendering method is our own.
 """
 
 import functools
@@ -24,46 +25,50 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lgmdjax.errors import InputError
 from lgmdjax.sensors import antialiasing, compositing, hemifield, silhouettes
+from lgmdjax.sensors.fusion import materialise
 from lgmdjax.world.arena import Arena
 from lgmdjax.world.texture import WAVES
 
-Leaf = Array | np.ndarray
+AnyArray = Array | np.ndarray
 
-_TILE = (math.radians(4.3), math.radians(8.6))
-"""About how high and wide a tile is: small ones hold few prisms, large ones are long loops."""
-_COARSE = 25.0
-"""Pictures of fewer pixels a radian have tiles of 2 x 4 pixels at least, others of 4 x 8, which are twice as fast."""
+_TILE_SIZE = (math.radians(4.3), math.radians(8.6))
+"""Approximate height and width of a tile [rad]: small tiles hold few prisms, large ones make long loops."""
+_COARSE_RESOLUTION = 25.0
+"""Below this resolution [px/rad] tiles are at least 2 x 4 pixels, above it 4 x 8, which are twice as fast."""
 
 
 @struct.dataclass(kw_only=True, frozen=True)
 class Params:
-    """The camera's structure, all of it static. Raises InputError where it cannot be."""
+    """Structure of the camera, all of it static. Raises InputError for values that are not possible.
+
+    >>> image_shape(Params(width=80, height=60, overlap=0.5))
+    (2, 60, 40)
+    """
 
     width: int = struct.field(pytree_node=False, default=320)
     height: int = struct.field(pytree_node=False, default=240)
     fov: float = struct.field(pytree_node=False, default=math.radians(170.0))
-    """Over the whole width [rad]."""
+    """Field of view over the whole width [rad]."""
     overlap: float = struct.field(pytree_node=False, default=1.0)
-    """Part of the width that an eye draws, from its own side: 0.5 (its half) .. 1 (all)."""
+    """Fraction of the width that each eye renders, from its own side: 0.5 (its half) .. 1 (all)."""
     samples: int = struct.field(pytree_node=False, default=1)
-    """Rays a pixel along each side; one is enough, since a ray stands for an area."""
-    slots: int = struct.field(pytree_node=False, default=6)
-    """Prisms that a tile can hold: the nearest (`crowding` tells how many there are)."""
+    """Rays per pixel along each side; one is enough, since a ray stands for an area."""
+    tile_capacity: int = struct.field(pytree_node=False, default=6)
+    """Number of prisms that a tile holds, the nearest ones (`max_tile_occupancy` counts how many there are)."""
     bands: int = struct.field(pytree_node=False, default=3)
-    """Scales of the textures, each less than half of the one before."""
+    """Number of texture scales, each less than half of the one before."""
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "samples", "slots", "bands"):
+        for name in ("width", "height", "samples", "tile_capacity", "bands"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise InputError(f"expected camera {name} as a whole number above 0, got {value!r}; change it")
         if self.bands > len(WAVES):
-            raise InputError(f"expected at most {len(WAVES)} bands of texture, got {self.bands}; lower camera bands")
+            raise InputError(f"expected at most {len(WAVES)} texture bands, got {self.bands}; lower camera bands")
         if not 0.5 <= self.overlap <= 1.0:
             raise InputError(f"expected a camera overlap in 0.5..1, got {self.overlap!r}; change it")
         if not 0.0 < self.fov * math.hypot(1.0, self.height / self.width) < 2.0 * math.pi:
@@ -73,51 +78,59 @@ class Params:
             )
 
 
-def shape(params: Params) -> tuple[int, int, int]:
+def image_shape(params: Params) -> tuple[int, int, int]:
     """Return the shape of a stereo pair: eyes, rows, columns."""
-    return 2, params.height, hemifield.columns(params.width, params.overlap)
+    return 2, params.height, hemifield.column_count(params.width, params.overlap)
 
 
 def render(
     params: Params,
     arena: Arena,
-    positions: Float[Leaf, "2 3"],
-    rotations: Float[Leaf, "2 3 3"] | Float[Leaf, "3 3"],
+    positions: Float[AnyArray, "2 3"],
+    rotations: Float[AnyArray, "2 3 3"] | Float[AnyArray, "3 3"],
 ) -> Float[Array, "2 height columns"]:
-    """Draw what the left and the right eye see, in grey levels 0..255.
+    """Render the images of the left and the right eye, in grey levels 0..255.
 
-    `positions` [m] and `rotations` (from the eye's frame to the world; one for both will do) are the eyes' poses. The
-    left eye draws its first columns, the right eye its last ones, as many as `shape` says.
-    Gradient: through outlines, by what they cover, and through depths and textures; zero through which prisms a tile
-    knows of.
+    With an `overlap` below 1 the left image has the first columns, the right image the last ones (`image_shape`).
+
+    Gradient: through the coverage of outlines and through depths and textures; zero through the choice of prisms that
+    a tile holds.
+
+    Args:
+        params: of the camera.
+        arena: the room.
+        positions: of the left and the right eye [m].
+        rotations: from each eye's frame to the world frame, or one for both eyes.
     """
-    grid, positions = _grid(params), jnp.asarray(positions)
-    grey = jax.vmap(functools.partial(_eye, params, arena), in_axes=(0, 0, grid.eyes))(
-        positions, jnp.broadcast_to(rotations, (2, 3, 3)), grid.fields(positions.dtype)
+    stereo, positions = _stereo_rays(params), jnp.asarray(positions)
+    grey = jax.vmap(functools.partial(_render_eye, params, arena), in_axes=(0, 0, stereo.axis))(
+        positions, jnp.broadcast_to(rotations, (2, 3, 3)), stereo.as_arrays(positions.dtype)
     )
-    # XLA draws anew in every loop that reads the picture, but never repeats a division by what it does not know.
-    one = 1.0 + 0.0 * lax.stop_gradient(positions[0, 0])
-    return _assemble(params, grey) / one
+    # Otherwise every loop that reads the image would render it again.
+    return materialise(_assemble_images(params, grey), positions[0, 0])
 
 
-def crowding(
+def max_tile_occupancy(
     params: Params,
     arena: Arena,
-    positions: Float[Leaf, "2 3"],
-    rotations: Float[Leaf, "2 3 3"] | Float[Leaf, "3 3"],
+    positions: Float[AnyArray, "2 3"],
+    rotations: Float[AnyArray, "2 3 3"] | Float[AnyArray, "3 3"],
 ) -> Int[Array, ""]:
-    """Count the prisms that may show in the fullest tile of a stereo pair; with as many `slots` none is left out."""
-    grid = _grid(params)
-    shows = jax.vmap(lambda *eye: _look(arena, *eye)[1], in_axes=(0, 0, grid.eyes))(
-        positions, jnp.broadcast_to(rotations, (2, 3, 3)), grid.fields(positions.dtype)
+    """Count the prisms that may be visible in the fullest tile of a stereo pair.
+
+    With a `tile_capacity` of at least this number, `render` leaves no prism out.
+    """
+    stereo = _stereo_rays(params)
+    visible = jax.vmap(lambda *eye: _visible_prisms(arena, *eye)[1], in_axes=(0, 0, stereo.axis))(
+        positions, jnp.broadcast_to(rotations, (2, 3, 3)), stereo.as_arrays(positions.dtype)
     )
-    return jnp.max(jnp.sum(shows, axis=-1))
+    return jnp.max(jnp.sum(visible, axis=-1))
 
 
-class _Field(NamedTuple):
-    """The pixels of an eye in its own frame, (3, tiles, pixels), and cones about them.
+class _TiledRays(NamedTuple):
+    """The rays of an eye in its own frame, (3, tiles, pixels), and cones that bound the tiles.
 
-    A tile is wider than high and has several cones, (tiles, cones) side by side: one about all of it would be high.
+    A tile is wider than high, and several cones side by side bound it, (tiles, cones): a single cone would be too high.
     """
 
     d: Array
@@ -127,66 +140,73 @@ class _Field(NamedTuple):
     radii: Array
 
 
-class _Grid(NamedTuple):
-    """The fields of both eyes on the host, stacked; of one if they are the same."""
+class _StereoRays(NamedTuple):
+    """The rays of both eyes on the host, stacked along `axis` 0; not stacked (`axis` None) if they are the same."""
 
-    field: tuple[np.ndarray, ...]
-    eyes: int | None
+    rays: tuple[np.ndarray, ...]
+    axis: int | None
 
-    def fields(self, dtype: jnp.dtype) -> _Field:
-        return _Field(*(jnp.asarray(a, dtype) for a in self.field))
+    def as_arrays(self, dtype: jnp.dtype) -> _TiledRays:
+        return _TiledRays(*(jnp.asarray(a, dtype) for a in self.rays))
 
 
 @functools.lru_cache(maxsize=32)
-def _grid(params: Params) -> _Grid:
-    columns = shape(params)[2]
+def _stereo_rays(params: Params) -> _StereoRays:
+    columns = image_shape(params)[2]
     if columns == params.width:
-        return _Grid(_field(params, 0), None)
-    fields = _field(params, 0), _field(params, params.width - columns)
-    return _Grid(tuple(np.stack(pair) for pair in zip(*fields, strict=True)), 0)
+        return _StereoRays(_tiled_rays(params, 0), None)
+    both = _tiled_rays(params, 0), _tiled_rays(params, params.width - columns)
+    return _StereoRays(tuple(np.stack(pair) for pair in zip(*both, strict=True)), 0)
 
 
-def _field(params: Params, first: int) -> tuple[np.ndarray, ...]:
-    """Lay out the rays from column `first` on, a few beyond the picture where tiles do not fit into it."""
+def _tiled_rays(params: Params, first_column: int) -> tuple[np.ndarray, ...]:
+    """Return the fields of `_TiledRays` from a column on; where tiles do not fit, some rays are outside the image."""
     n, f = params.samples, _focal_length(params)
-    rows, across, high, wide = _tiles(params)
-    v, u = np.mgrid[: rows * high, : across * wide] + 0.5
-    pixels = equidistant(u + n * first - 0.5 * n * params.width, v - 0.5 * n * params.height, f)
-    d, d_u, d_v = (np.swapaxes(a.reshape(3, rows, high, across, wide), 2, 3) for a in pixels)
+    rows, columns, high, wide = _tile_layout(params)
+    v, u = np.mgrid[: rows * high, : columns * wide] + 0.5
+    pixels = equidistant_directions(u + n * first_column - 0.5 * n * params.width, v - 0.5 * n * params.height, f)
+    d, d_u, d_v = (np.swapaxes(a.reshape(3, rows, high, columns, wide), 2, 3) for a in pixels)
     size = min(high, wide)
     parts = d[..., np.linspace(0, wide - size, -(-wide // size)).astype(int)[:, None] + np.arange(size)]
     axes = parts.sum(axis=(3, 5))
     axes /= np.linalg.norm(axes, axis=0)
     cosines = np.einsum("archpw,arcp->rchpw", parts, axes).min(axis=(2, 4))
-    # A pixel reaches farther than its ray, by half a diagonal.
+    # A pixel extends beyond its ray by half a diagonal.
     radii = np.arccos(np.clip(cosines, -1.0, 1.0)) + 0.75 / f
-    tiles = rows * across
+    tiles = rows * columns
     d, d_u, d_v = (a.reshape(3, tiles, -1) for a in (d, d_u, d_v))
     return d, d_u, d_v, np.moveaxis(axes, 0, -1).reshape(tiles, -1, 3), radii.reshape(tiles, -1)
 
 
 def _focal_length(params: Params) -> float:
-    """Give f in rays a radian."""
+    """Return f in rays per radian."""
     return params.samples * params.width / params.fov
 
 
-def _tiles(params: Params) -> tuple[int, int, int, int]:
-    """Count the rows and columns of tiles, and the rows and columns of rays in each."""
-    (_, height, columns), n, f = shape(params), params.samples, _focal_length(params)
-    least = 2 if f < _COARSE else 4
-    high, wide = tile(height * n, _TILE[0] * f, least), tile(columns * n, _TILE[1] * f, 2 * least)
+def _tile_layout(params: Params) -> tuple[int, int, int, int]:
+    """Return the numbers of rows and columns of tiles, and of rows and columns of rays in each tile."""
+    (_, height, columns), n, f = image_shape(params), params.samples, _focal_length(params)
+    minimum = 2 if f < _COARSE_RESOLUTION else 4
+    high = tile_size(height * n, _TILE_SIZE[0] * f, minimum)
+    wide = tile_size(columns * n, _TILE_SIZE[1] * f, 2 * minimum)
     return -(-height * n // high), -(-columns * n // wide), high, wide
 
 
-def tile(length: int, wanted: float, least: int) -> int:
-    """Choose the size of tiles along a side of the picture: near the one wanted, and such that they fit into it."""
-    wanted = max(least, round(wanted))
-    sizes = [size for size in range(-(-wanted // 2), 2 * wanted + 1) if length % size == 0]
-    return min(sizes, key=lambda size: abs(math.log(size / wanted)), default=wanted)
+def tile_size(length: int, target: float, minimum: int) -> int:
+    """Return the divisor of `length` [px] that is nearest to `target` or to `minimum`, whichever is larger.
+
+    Where no divisor is within a factor of two, that size itself is returned, and the tiles extend beyond the image.
+
+    >>> tile_size(240, 7.0, 4)
+    8
+    """
+    target = max(minimum, round(target))
+    sizes = [size for size in range(-(-target // 2), 2 * target + 1) if length % size == 0]
+    return min(sizes, key=lambda size: abs(math.log(size / target)), default=target)
 
 
-def equidistant(u: np.ndarray, v: np.ndarray, f: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions of the pixels (u, v) from the middle, and their derivatives by u and v."""
+def equidistant_directions(u: np.ndarray, v: np.ndarray, f: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the directions of pixels (u, v) from the middle, and their derivatives by u and by v."""
     rho = np.maximum(np.hypot(u, v), 1e-9)
     theta = rho / f
     spread = np.sin(theta) / rho
@@ -197,30 +217,35 @@ def equidistant(u: np.ndarray, v: np.ndarray, f: float) -> tuple[np.ndarray, np.
     return d, d_u, d_v
 
 
-def _look(arena: Arena, position: Array, rotation: Array, field: _Field) -> tuple[silhouettes.Silhouette, Array]:
-    """See the prisms from an eye, and which of them may show in which tile."""
-    prisms, bounds = silhouettes.look(arena, position)
-    shows = silhouettes.may_show(prisms, bounds, field.axes @ rotation.T, field.radii)
-    return prisms, jnp.any(shows, axis=1)
+def _visible_prisms(
+    arena: Arena, position: Array, rotation: Array, rays: _TiledRays
+) -> tuple[silhouettes.Silhouette, Bool[Array, "tiles prisms"]]:
+    """Return the silhouettes of all prisms, and which of them may be visible in which tile."""
+    prisms, bounds = silhouettes.project_prisms(arena, position)
+    visible = silhouettes.may_be_visible(prisms, bounds, rays.axes @ rotation.T, rays.radii)
+    return prisms, jnp.any(visible, axis=1)
 
 
-def _eye(params: Params, arena: Arena, position: Array, rotation: Array, field: _Field) -> Array:
-    """Draw one eye: (tiles, pixels), each tile's pixels in a row, for which XLA's loops read its prisms once."""
-    picked = silhouettes.pick(*_look(arena, position, rotation, field), params.slots)
-    picked = jax.tree.map(lambda a: a[:, None], picked)
+def _render_eye(
+    params: Params, arena: Arena, position: Array, rotation: Array, rays: _TiledRays
+) -> Float[Array, "tiles pixels"]:
+    """Render one eye. Pixels of a tile are contiguous, so that XLA's loop over them reads the tile's prisms once."""
+    prisms, visible = _visible_prisms(arena, position, rotation, rays)
+    nearest = silhouettes.select_nearest(prisms, visible, params.tile_capacity)
+    nearest = jax.tree.map(lambda a: a[:, None], nearest)
 
-    def turned(rays: Array) -> tuple[Array, Array, Array]:
-        x, y, z = (rotation[i, 0] * rays[0] + rotation[i, 1] * rays[1] + rotation[i, 2] * rays[2] for i in range(3))
+    def to_world(d: Array) -> tuple[Array, Array, Array]:
+        x, y, z = (rotation[i, 0] * d[0] + rotation[i, 1] * d[1] + rotation[i, 2] * d[2] for i in range(3))
         return x, y, z
 
-    rays = antialiasing.rays(turned(field.d), turned(field.d_u), turned(field.d_v))
-    return compositing.draw(arena, position, rays, picked, params.bands)
+    pixels = antialiasing.pixel_rays(to_world(rays.d), to_world(rays.d_u), to_world(rays.d_v))
+    return compositing.composite(arena, position, pixels, nearest, params.bands)
 
 
-def _assemble(params: Params, grey: Array) -> Array:
-    """Join the tiles, cut off what is beyond the picture, and average the samples of a pixel."""
-    (eyes, height, columns), n = shape(params), params.samples
-    rows, across, high, wide = _tiles(params)
-    lines = jnp.swapaxes(grey.reshape(eyes, rows, across, high, wide), 2, 3)
-    picture = lines.reshape(eyes, rows * high, across * wide)[:, : height * n, : columns * n]
-    return picture if n == 1 else jnp.mean(picture.reshape(eyes, height, n, columns, n), axis=(2, 4))
+def _assemble_images(params: Params, grey: Array) -> Array:
+    """Join the tiles of both eyes, crop them to the image, and average the samples of each pixel."""
+    (eyes, height, columns), n = image_shape(params), params.samples
+    tile_rows, tile_columns, high, wide = _tile_layout(params)
+    lines = jnp.swapaxes(grey.reshape(eyes, tile_rows, tile_columns, high, wide), 2, 3)
+    images = lines.reshape(eyes, tile_rows * high, tile_columns * wide)[:, : height * n, : columns * n]
+    return images if n == 1 else jnp.mean(images.reshape(eyes, height, n, columns, n), axis=(2, 4))

@@ -1,18 +1,18 @@
-"""What covers a pixel: the surfaces in front of it, nearest first, by how much each covers and what grey it has.
+"""Compositing: blend the surfaces in front of each pixel, nearest first, by coverage and grey level.
 
-Everything here is elementwise over rays, so that XLA makes one vectorised loop of it. Components of vectors are
-arrays of their own for the same reason.
+Everything here is elementwise over rays, so that XLA compiles it to one vectorised loop. Components of vectors are
+separate arrays for the same reason.
 
-| symbol | name                                      | unit | where         |
-| ------ | ----------------------------------------- | ---- | ------------- |
-| d      | direction of a ray in the world           | 1    | `edges`       |
-| s      | surface as inverse depth, 1/t = s . d     | 1/m  | `silhouettes` |
-| a      | part of a pixel that a surface covers     | 1    | `edges`       |
+| symbol | name                                      | unit | where          |
+| ------ | ----------------------------------------- | ---- | -------------- |
+| d      | direction of a ray in the world           | 1    | `antialiasing` |
+| s      | surface as inverse depth, 1/t = s . d     | 1/m  | `silhouettes`  |
+| a      | coverage: part of a pixel that is covered | 1    | `antialiasing` |
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -20,316 +20,358 @@ from jax import lax
 from jaxtyping import Array
 
 from lgmdjax.minmax import maximum
-from lgmdjax.sensors import antialiasing
-from lgmdjax.sensors.silhouettes import NEAR, Pair, Silhouette
+from lgmdjax.sensors import antialiasing, fusion
+from lgmdjax.sensors.antialiasing import PixelRays
+from lgmdjax.sensors.fusion import Tree
+from lgmdjax.sensors.silhouettes import MIN_DISTANCE, Pair, Silhouette
 from lgmdjax.world import texture
 from lgmdjax.world.arena import Arena
 from lgmdjax.world.texture import Texture, Vector
 
-Arrays = TypeVar("Arrays")
-Keep = Callable[[Any], Any]
-
-_FAR = 1.0e3
+_MAX_DEPTH = 1.0e3
 """What is farther away [m] is shaded as if it were here."""
-
-
-_OPEN = 1.0e4
-"""A margin [px], or an inverse depth [1/m], that stands for no limit at all."""
-_BACK = 0.97
-"""Walls count as farther away, so that what touches them is not cut by them within a pixel of its outline."""
+_UNBOUNDED = 1.0e4
+"""A margin [px], or an inverse depth [1/m], that stands for no limit."""
+_WALL_BIAS = 0.97
+"""Factor on the inverse depth of walls, so that they do not cut off the edge pixels of what touches them."""
 
 
 class Layer(NamedTuple):
     """A surface in front of each pixel."""
 
-    nearness: Array
-    """1/t, by which layers are ordered; -1: not there."""
-    cover: Array
+    inverse_depth: Array
+    """1/t, by which layers are ordered; -1: no surface."""
+    coverage: Array
     """a."""
-    shift: Pair
-    """Columns and rows from the middle of the pixel to that of the part that is covered."""
+    centroid: Pair
+    """Columns and rows from the middle of the pixel to the middle of the covered part."""
     s: Vector
-    centre: Pair
-    """Where the texture's origin is, from the eye [m]."""
+    texture_origin: Pair
+    """Position of the texture's origin relative to the eye, in plan [m]."""
     texture: Texture
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
-def draw(arena: Arena, eye: Array, pixels: antialiasing.Rays, prisms: list[Silhouette], bands: int) -> Array:
-    """Blend the two nearest layers of every pixel over the mean grey of the third and of what is behind that.
+class _FlatLayer(NamedTuple):
+    """A layer of uniform grey. The third layer needs no texture: it shows in few pixels."""
 
-    Arrays of pixels are (tiles, pixels), those of prisms (tiles, 1).
-
-    Gradient: that of the same drawing with its loops as `lax.scan`, and with what many loops read written down.
-    Unrolled they are one expression, the fastest to evaluate, but its derivative would take minutes to compile. The
-    picture itself is the fast drawing's, with a derivative or without.
-    """
-    return _draw(_AT_ONCE, arena, eye, pixels, prisms, bands)
-
-
-@draw.defjvp
-def _draw_jvp(bands: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    _, slope = jax.jvp(functools.partial(_draw, _IN_STEPS, bands=bands), primals, tangents)
-    return draw(*primals, bands), slope
-
-
-class _Way(NamedTuple):
-    """How to draw: what goes over prisms and layers, and what is done to arrays that much hangs on."""
-
-    scan: Callable[[Callable, Any, list], tuple[Any, Any]]
-    keep: Callable[[Any, Array], Any]
-
-
-def _draw(
-    way: _Way, arena: Arena, eye: Array, pixels: antialiasing.Rays, prisms: list[Silhouette], bands: int
-) -> Array:
-    def keep(arrays: Arrays) -> Arrays:
-        return way.keep(arrays, eye)
-
-    pixels = keep(pixels)
-    room = _room(arena, eye, pixels, keep)
-    background = room.first.nearness
-    third = _Plain(background, jnp.zeros_like(background), jnp.zeros_like(background))
-    nearest = jax.tree.map(lambda a: jnp.broadcast_to(a, background.shape), (room.first, room.second, third))
-
-    def insert(layers: tuple[Layer, Layer, _Plain], prism: Silhouette) -> tuple[tuple[Layer, Layer, _Plain], None]:
-        return _insert(_prism(prism, pixels, keep), *layers), None
-
-    def shade(carry: None, layer: Layer) -> tuple[None, Array]:
-        return carry, _shade(arena.handedness, eye, pixels, layer, bands)
-
-    (first, second, third), _ = way.scan(insert, nearest, prisms)
-    behind_two = jnp.where(second.nearness > background, room.behind_two, room.behind_one)
-    rest = jnp.where(third.nearness > background, room.behind_three, behind_two)
-    rest = rest + third.cover * (third.grey - rest)
-    # What the first layer leaves of a pixel has its middle opposite.
-    opposite = antialiasing.once(-first.cover / (1.001 - first.cover))
-    shift = first.shift[0] * opposite, first.shift[1] * opposite
-    _, (nearer, farther) = way.scan(shade, None, [first, second._replace(shift=shift)])
-    return rest + second.cover * (1.0 - first.cover) * (farther - rest) + first.cover * (nearer - rest)
-
-
-def _unrolled(body: Callable, carry: Any, inputs: list) -> tuple[Any, list]:
-    """`lax.scan` over a list, written out."""
-    outputs = []
-    for one in inputs:
-        carry, output = body(carry, one)
-        outputs.append(output)
-    return carry, outputs
-
-
-def _scanned(body: Callable, carry: Any, inputs: list) -> tuple[Any, Any]:
-    """`lax.scan` over a list, whose reverse mode remembers nothing but the carries."""
-    return lax.scan(jax.checkpoint(body), carry, jax.tree.map(lambda *leaves: jnp.stack(leaves), *inputs))
-
-
-def _written(arrays: Any, eye: Array) -> Any:
-    """Have XLA write arrays to memory, and on the way back what it knows of them.
-
-    Each of the many loops that read one would else compute it anew, with all that it comes from. A division is never
-    repeated, and that this one is by 1 is not known before the eye is.
-    """
-    one = 1.0 + 0.0 * lax.stop_gradient(eye[0])
-    return jax.tree.map(lambda a: a / one, arrays)
-
-
-_AT_ONCE = _Way(_unrolled, lambda arrays, _: arrays)
-_IN_STEPS = _Way(_scanned, _written)
-
-
-class _Plain(NamedTuple):
-    """A layer without its texture: the third counts in few pixels."""
-
-    nearness: Array
-    cover: Array
+    inverse_depth: Array
+    coverage: Array
     grey: Array
 
 
-def _insert(layer: Layer, first: Layer, second: Layer, third: _Plain) -> tuple[Layer, Layer, _Plain]:
-    """Keep the three nearest of four layers."""
-    is_first, is_second = layer.nearness > first.nearness, layer.nearness > second.nearness
-    is_third = layer.nearness > third.nearness
-    loser = choose(is_second, _plain(second), _plain(layer))
-    runner_up = choose(is_first, first, layer)
-    return choose(is_first, layer, first), choose(is_second, runner_up, second), choose(is_third, loser, third)
+_Nearest = tuple[Layer, Layer, _FlatLayer]
 
 
-def _plain(layer: Layer) -> _Plain:
-    return _Plain(layer.nearness, layer.cover, layer.texture.brightness)
+@runtime_checkable
+class _Materialise(Protocol):
+    def __call__(self, arrays: Tree, /) -> Tree: ...
 
 
-def _prism(prism: Silhouette, pixels: antialiasing.Rays, keep: Keep) -> Layer:
-    """What a prism covers of each pixel, and with which face."""
-    d, (across_x, across_y) = pixels.d, pixels.across
-    beyond = (prism.open - 0.5) * _OPEN
-    margins = keep([n[0] * across_x + n[1] * across_y + beyond for n in (prism.left, prism.right)])
-    left, right = (antialiasing.part(margin, pixels.slant) for margin in margins)
-    by_side = 0.5 * (right - left)
-    near, far = keep(_sides(prism, pixels, by_side))
-    side = antialiasing.slopes(near, pixels)
-    # From within its wedge a prism can be entered by its lid only, and only the lid ends.
-    within, lidless = prism.open > 0.75, prism.lid == 0
-    last = antialiasing.slopes(choose(lidless, near, far), pixels)
-    upward = jnp.where(prism.lid > 0, -1.0, 1.0).astype(prism.lid.dtype)
-    lid_rise, lid_shift = antialiasing.rise(prism.lid_end, last, pixels)
-    other_rise, other_shift = antialiasing.rise(prism.other_end, side, pixels)
-    to_lid = antialiasing.ramp(upward * lid_rise + jnp.where(within & lidless, _OPEN, 0.0))
-    to_other = antialiasing.ramp(jnp.where(within, _OPEN, 0.0) - upward * other_rise)
-    by_lid_end, by_other_end = 0.5 * upward * (1.0 - to_lid), 0.5 * upward * (to_other - 1.0)
-    shift_u, shift_v = (
-        by_lid_end * lid_shift[i] + by_other_end * other_shift[i] + by_side * pixels.rightward[i] for i in (0, 1)
+class _Strategy(NamedTuple):
+    """How to evaluate the image: the loops over prisms and layers, and whether to write intermediates to memory."""
+
+    fold: Callable[[Callable[[_Nearest, Silhouette], _Nearest], _Nearest, list[Silhouette]], _Nearest]
+    map: Callable[[Callable[[Layer], Array], list[Layer]], Iterable[Array]]
+    materialise: Callable[[Array], _Materialise]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(4,))
+def composite(arena: Arena, eye: Array, rays: PixelRays, prisms: list[Silhouette], bands: int) -> Array:
+    """Blend the two nearest layers of every pixel over the mean grey of the third and of what is behind it.
+
+    Gradient: that of the same function evaluated with `lax.scan` and with materialised intermediates. Unrolled, the
+    loops are a single expression that is fastest to evaluate, but its derivative would take minutes to compile. The
+    image itself is always that of the unrolled loops.
+
+    Args:
+        arena: the room, of which walls, floor and sky are used.
+        eye: position [m].
+        rays: one a pixel, arrays of shape (tiles, pixels).
+        prisms: the prisms of each tile, nearest first, arrays of shape (tiles, 1).
+        bands: number of texture scales.
+    """
+    return _composite(_UNROLLED, arena, eye, rays, prisms, bands=bands)
+
+
+@composite.defjvp
+def _composite_jvp(bands: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    _, tangent = jax.jvp(functools.partial(_composite, _SCANNED, bands=bands), primals, tangents)
+    return composite(*primals, bands), tangent
+
+
+def _composite(
+    strategy: _Strategy, arena: Arena, eye: Array, rays: PixelRays, prisms: list[Silhouette], *, bands: int
+) -> Array:
+    materialise = strategy.materialise(eye)
+    rays = materialise(rays)
+    room = _room_layers(arena, eye, rays, materialise)
+    background = room.first.inverse_depth
+    third = _FlatLayer(background, jnp.zeros_like(background), jnp.zeros_like(background))
+    nearest = jax.tree.map(lambda a: jnp.broadcast_to(a, background.shape), (room.first, room.second, third))
+
+    def insert(layers: _Nearest, prism: Silhouette) -> _Nearest:
+        return _insert(_prism_layer(prism, rays, materialise), *layers)
+
+    def shade(layer: Layer) -> Array:
+        return _shade(arena.handedness, eye, rays, layer, bands)
+
+    first, second, third = strategy.fold(insert, nearest, prisms)
+    behind_two = jnp.where(second.inverse_depth > background, room.behind_two, room.behind_one)
+    rest = jnp.where(third.inverse_depth > background, room.behind_three, behind_two)
+    rest = rest + third.coverage * (third.grey - rest)
+    # The middle of what the first layer leaves of a pixel is on the opposite side.
+    opposite = fusion.fusible(-first.coverage / (1.001 - first.coverage))
+    centroid = first.centroid[0] * opposite, first.centroid[1] * opposite
+    nearer, farther = strategy.map(shade, [first, second._replace(centroid=centroid)])
+    return rest + second.coverage * (1.0 - first.coverage) * (farther - rest) + first.coverage * (nearer - rest)
+
+
+def _fold_unrolled(
+    function: Callable[[_Nearest, Silhouette], _Nearest], layers: _Nearest, prisms: list[Silhouette]
+) -> _Nearest:
+    return functools.reduce(function, prisms, layers)
+
+
+def _fold_scanned(
+    function: Callable[[_Nearest, Silhouette], _Nearest], layers: _Nearest, prisms: list[Silhouette]
+) -> _Nearest:
+    """Fold by `lax.scan`, whose backward pass stores nothing but the layers before each prism."""
+    body = jax.checkpoint(lambda layers, prism: (function(layers, prism), None))
+    return lax.scan(body, layers, _stack(prisms))[0]
+
+
+def _map_unrolled(function: Callable[[Layer], Array], layers: list[Layer]) -> Iterable[Array]:
+    return [function(layer) for layer in layers]
+
+
+def _map_scanned(function: Callable[[Layer], Array], layers: list[Layer]) -> Iterable[Array]:
+    """Map by `lax.scan`, whose backward pass stores nothing."""
+    return lax.scan(jax.checkpoint(lambda _, layer: (None, function(layer))), None, _stack(layers))[1]
+
+
+def _stack(trees: list[Tree]) -> Tree:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def _materialise_by(eye: Array) -> _Materialise:
+    def materialise(arrays: Tree, /) -> Tree:
+        return fusion.materialise(arrays, eye[0])
+
+    return materialise
+
+
+def _keep_lazy(eye: Array) -> _Materialise:
+    def unchanged(arrays: Tree, /) -> Tree:
+        return arrays
+
+    return unchanged
+
+
+_UNROLLED = _Strategy(_fold_unrolled, _map_unrolled, _keep_lazy)
+_SCANNED = _Strategy(_fold_scanned, _map_scanned, _materialise_by)
+
+
+def _insert(layer: Layer, first: Layer, second: Layer, third: _FlatLayer) -> _Nearest:
+    """Return the three nearest of four layers, nearest first."""
+    is_first, is_second = layer.inverse_depth > first.inverse_depth, layer.inverse_depth > second.inverse_depth
+    is_third = layer.inverse_depth > third.inverse_depth
+    old_second = tree_where(is_second, _flatten(second), _flatten(layer))
+    old_first = tree_where(is_first, first, layer)
+    return (
+        tree_where(is_first, layer, first),
+        tree_where(is_second, old_first, second),
+        tree_where(is_third, old_second, third),
     )
-    cover = maximum(left + right - 1.0, 0.0) * maximum(to_lid + to_other - 1.0, 0.0)
-    on_lid = prism.lid * d[2]
-    by_lid = on_lid < side[0] + jnp.where(lidless, -_OPEN, jnp.where(within, _OPEN, 0.0))
-    s = (jnp.where(by_lid, 0.0, near[0]), jnp.where(by_lid, 0.0, near[1]), jnp.where(by_lid, prism.lid, 0.0))
-    nearness = jnp.where(cover > 0, jnp.where(by_lid, on_lid, side[0]), -1.0)
-    nearness, cover, shift, s = keep((nearness, cover, (shift_u, shift_v), s))
-    return Layer(nearness, cover, shift, s, prism.centre, prism.texture)
 
 
-def _sides(prism: Silhouette, pixels: antialiasing.Rays, shift: Array) -> tuple[Pair, Pair]:
-    """s of the sides by which rays enter and leave, were the prism endless upward and downward.
+def _flatten(layer: Layer) -> _FlatLayer:
+    return _FlatLayer(layer.inverse_depth, layer.coverage, layer.texture.brightness)
 
-    The rays are those through the middle of what is covered of a pixel, `shift` to the right of its own.
+
+def _prism_layer(prism: Silhouette, rays: PixelRays, materialise: _Materialise) -> Layer:
+    """Return what a prism covers of each pixel, and the face by which it does so."""
+    d, (scale_x, scale_y) = rays.d, rays.pixel_scale
+    unbounded = (prism.wedge - 0.5) * _UNBOUNDED
+    normals = prism.left_normal, prism.right_normal
+    margins = materialise([n[0] * scale_x + n[1] * scale_y + unbounded for n in normals])
+    left, right = (antialiasing.edge_coverage(margin, rays.upright) for margin in margins)
+    by_side = 0.5 * (right - left)
+    near, far = materialise(_side_faces(prism, rays, by_side))
+    side = antialiasing.inverse_depth(near, rays)
+    # From within its plan a prism can be entered by its cap only, and only the cap bounds it.
+    within, capless = prism.wedge > 0.75, prism.inverse_cap_z == 0
+    last = antialiasing.inverse_depth(tree_where(capless, near, far), rays)
+    upward = jnp.where(prism.inverse_cap_z > 0, -1.0, 1.0).astype(prism.inverse_cap_z.dtype)
+    cap_margin, cap_direction = antialiasing.margin_below(prism.cap_z, last, rays)
+    opposite_margin, opposite_direction = antialiasing.margin_below(prism.opposite_z, side, rays)
+    to_cap = antialiasing.linear_coverage(upward * cap_margin + jnp.where(within & capless, _UNBOUNDED, 0.0))
+    to_opposite = antialiasing.linear_coverage(jnp.where(within, _UNBOUNDED, 0.0) - upward * opposite_margin)
+    by_cap, by_opposite = 0.5 * upward * (1.0 - to_cap), 0.5 * upward * (to_opposite - 1.0)
+    centroid_u, centroid_v = (
+        by_cap * cap_direction[i] + by_opposite * opposite_direction[i] + by_side * rays.rightward[i] for i in (0, 1)
+    )
+    coverage = maximum(left + right - 1.0, 0.0) * maximum(to_cap + to_opposite - 1.0, 0.0)
+    cap = prism.inverse_cap_z * d[2]
+    on_cap = cap < side[0] + jnp.where(capless, -_UNBOUNDED, jnp.where(within, _UNBOUNDED, 0.0))
+    s = (jnp.where(on_cap, 0.0, near[0]), jnp.where(on_cap, 0.0, near[1]), jnp.where(on_cap, prism.inverse_cap_z, 0.0))
+    inverse_depth = jnp.where(coverage > 0, jnp.where(on_cap, cap, side[0]), -1.0)
+    inverse_depth, coverage, centroid, s = materialise((inverse_depth, coverage, (centroid_u, centroid_v), s))
+    return Layer(inverse_depth, coverage, centroid, s, prism.centre, prism.texture)
+
+
+def _side_faces(prism: Silhouette, rays: PixelRays, shift: Array) -> tuple[Pair, Pair]:
+    """Return s of the sides by which rays enter and leave a prism of unlimited height.
+
+    The rays are those through the middle of the covered part of a pixel, which is `shift` to the right of its own.
     """
-    x, y = pixels.d[0] + shift * pixels.turn[0], pixels.d[1] + shift * pixels.turn[1]
-    c, s = prism.axis
+    x, y = rays.d[0] + shift * rays.rightward_d[0], rays.d[1] + shift * rays.rightward_d[1]
+    c, s = prism.x_axis
     along, aside = c * x + s * y, c * y - s * x
-    near_x, far_x, between_x = _faces(prism.ahead[0], prism.behind[0], along)
-    near_y, far_y, between_y = _faces(prism.ahead[1], prism.behind[1], aside)
-    # A box is entered by the last of its near faces and left by the first of its far ones.
-    none = jnp.where(between_x, _OPEN, 0.0) - jnp.where(between_y, _OPEN, 0.0)
-    near = choose(near_x * along + none < near_y * aside, (near_x * c, near_x * s), (-near_y * s, near_y * c))
-    far = choose(far_x * along > far_y * aside, (far_x * c, far_x * s), (-far_y * s, far_y * c))
-    near_round, far_round = _round_sides(prism, x, y, pixels.slant.p)
-    is_round = prism.radius_square > 0
-    return choose(is_round, near_round, near), choose(is_round, far_round, far)
+    near_x, far_x, between_x = _slab_faces(prism.inverse_front[0], prism.inverse_back[0], along)
+    near_y, far_y, between_y = _slab_faces(prism.inverse_front[1], prism.inverse_back[1], aside)
+    # A ray enters a box by the last of its near faces and leaves it by the first of its far ones.
+    no_face = jnp.where(between_x, _UNBOUNDED, 0.0) - jnp.where(between_y, _UNBOUNDED, 0.0)
+    near = tree_where(near_x * along + no_face < near_y * aside, (near_x * c, near_x * s), (-near_y * s, near_y * c))
+    far = tree_where(far_x * along > far_y * aside, (far_x * c, far_x * s), (-far_y * s, far_y * c))
+    near_tangent, far_tangent = _tangent_planes(prism, x, y, rays.upright.p)
+    is_cylinder = prism.radius_squared > 0
+    return tree_where(is_cylinder, near_tangent, near), tree_where(is_cylinder, far_tangent, far)
 
 
-def _faces(ahead: Array, behind: Array, along: Array) -> tuple[Array, Array, Array]:
-    """1/distance, along an axis, of a box's near and far face, and whether the eye is between: then both are far."""
-    beyond_ahead, between = ahead < 0, (ahead > 0) & (behind < 0)
-    far = jnp.where(beyond_ahead, behind, ahead)
-    far_behind = jnp.where(between, behind, far)
-    return jnp.where(beyond_ahead, ahead, behind), jnp.where(along > 0, far, far_behind), between
+def _slab_faces(front: Array, back: Array, along: Array) -> tuple[Array, Array, Array]:
+    """Return 1/distance, along an axis, of a box's near and far face, and whether the eye is between the two.
 
-
-def _round_sides(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[Pair, Pair]:
-    """s of the planes that touch a cylinder where a ray enters and leaves it: o/c +- ((d.o) o/c - d)/q.
-
-    q^2 = (d.o)^2 - c d^2, taken as r^2 d^2 - (o x d)^2, which keeps its digits, and not let below what it is a tenth
-    of a pixel inside the limb, where the side turns away without end.
+    If it is, both faces count as far.
     """
-    (o_x, o_y), power = prism.centre, prism.power
-    p_x, p_y = o_x * power, o_y * power
+    beyond_front, between = front < 0, (front > 0) & (back < 0)
+    far = jnp.where(beyond_front, back, front)
+    far_behind = jnp.where(between, back, far)
+    return jnp.where(beyond_front, front, back), jnp.where(along > 0, far, far_behind), between
+
+
+def _tangent_planes(prism: Silhouette, x: Array, y: Array, width: Array) -> tuple[Pair, Pair]:
+    """Return s of the planes that touch a cylinder where a ray enters and leaves it: o/c +- ((d.o) o/c - d)/q.
+
+    q^2 = (d.o)^2 - c d^2 is computed as r^2 d^2 - (o x d)^2, which is more accurate. At the outline q is zero and the
+    side turns away without bound, so q^2 is at least its value a tenth of a pixel inside.
+    """
+    (o_x, o_y), inverse_power = prism.centre, prism.inverse_power
+    p_x, p_y = o_x * inverse_power, o_y * inverse_power
     moment = o_x * y - o_y * x
-    q_square = prism.radius_square * (x * x + y * y) - moment * moment
-    inverse = lax.rsqrt(maximum(q_square, 0.2 * prism.limb * width + 1e-12))
+    q_squared = prism.radius_squared * (x * x + y * y) - moment * moment
+    inverse = lax.rsqrt(maximum(q_squared, 0.2 * prism.contour_scale * width + 1e-12))
     b = o_x * x + o_y * y
     e_x, e_y = (b * p_x - x) * inverse, (b * p_y - y) * inverse
     return (p_x + e_x, p_y + e_y), (p_x - e_x, p_y - e_y)
 
 
-class _Room(NamedTuple):
-    """Walls, floor and sky of every pixel: two layers, and what is behind."""
+class _RoomLayers(NamedTuple):
+    """Walls, floor and sky of every pixel: two layers, and what is behind them."""
 
     first: Layer
     second: Layer
     behind_one: Array
-    """Grey behind both layers, where at most one prism is before them."""
+    """Grey behind both layers, with at most one prism in front of them."""
     behind_two: Array
-    """Mean grey behind the first layer, if two prisms are."""
+    """Mean grey behind the first layer, with two prisms in front."""
     behind_three: Array
-    """Mean grey of the room, if three are."""
+    """Mean grey of the room, with three prisms in front."""
 
 
-def _room(arena: Arena, eye: Array, pixels: antialiasing.Rays, keep: Keep) -> _Room:
-    """Draw the room without obstacles: wall or floor, whichever has more of the pixel, then what it shares it with."""
-    by_x, along_x, along_y = _walls(arena, eye, pixels.d)
-    wall_s, other_s = keep((choose(by_x, along_x, along_y), choose(by_x, along_y, along_x)))
-    slopes = antialiasing.slopes(wall_s, pixels)
-    part, corner_shift = _part_of_nearer(wall_s, other_s, pixels)
-    floor, floor_shift = antialiasing.part_below(-eye[2], slopes, pixels)
-    below_top, top_shift = antialiasing.part_below(arena.wall_height - eye[2], slopes, pixels)
+def _room_layers(arena: Arena, eye: Array, rays: PixelRays, materialise: _Materialise) -> _RoomLayers:
+    """Return the layers of the empty room: wall or floor, whichever covers more of the pixel, then its neighbour."""
+    by_x, along_x, along_y = _wall_faces(arena, eye, rays.d)
+    wall_s, other_s = materialise((tree_where(by_x, along_x, along_y), tree_where(by_x, along_y, along_x)))
+    wall_depth = antialiasing.inverse_depth(wall_s, rays)
+    part, corner_direction = _coverage_of_nearer(wall_s, other_s, rays)
+    floor, floor_direction = antialiasing.coverage_below(-eye[2], wall_depth, rays)
+    below_top, top_direction = antialiasing.coverage_below(arena.wall_height - eye[2], wall_depth, rays)
     sky = 1.0 - below_top
     wall = maximum(1.0 - floor - sky, 0.0)
+    wall_row, other_row, floor_row = _room_textures(arena, rays.d, by_x)
 
-    rows = texture.prepare(arena.wall_texture)
-    x_row, y_row = (choose(pixels.d[i] > 0, _row(rows, 2 * i + 1), _row(rows, 2 * i)) for i in (0, 1))
-    wall_row, other_row = choose(by_x, x_row, y_row), choose(by_x, y_row, x_row)
-    floor_row = texture.prepare(arena.floor_texture)
     floor_first = floor > 0.5
-    # Floor and sky hide nothing.
-    nearness = jnp.where(floor_first | (sky > 0.5), 0.0, _BACK * slopes[0])
+    # Floor and sky occlude nothing.
+    inverse_depth = jnp.where(floor_first | (sky > 0.5), 0.0, _WALL_BIAS * wall_depth[0])
     on_edge = floor > sky
-
     down, up = jnp.where(floor_first, 0.5 * (1.0 - floor), -0.5 * floor), 0.5 * sky
     aside = jnp.where(floor_first | on_edge, 0.0, 0.5 * (1.0 - part))
-    shift_u, shift_v = (
-        down * a + up * b + aside * c for a, b, c in zip(floor_shift, top_shift, corner_shift, strict=True)
-    )
+    directions = zip(floor_direction, top_direction, corner_direction, strict=True)
+    centroid_u, centroid_v = (down * a + up * b + aside * c for a, b, c in directions)
 
-    def layer(cover: Array, s: Vector, row: Texture) -> Layer:
-        return Layer(nearness, cover, (shift_u, shift_v), s, (-eye[0], -eye[1]), row)
+    def layer(coverage: Array, s: Vector, row: Texture) -> Layer:
+        return Layer(inverse_depth, coverage, (centroid_u, centroid_v), s, (-eye[0], -eye[1]), row)
 
     zero = jnp.zeros_like(part)
-    as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / maximum(eye[2], NEAR)), floor_row)
+    as_floor = layer(jnp.where(floor_first, floor, 1.0), (zero, zero, -1.0 / maximum(eye[2], MIN_DISTANCE)), floor_row)
     as_wall = layer(jnp.where(floor_first, 1.0, jnp.where(on_edge, wall, wall * part)), (*wall_s, zero), wall_row)
     as_other = layer(wall * (1.0 - part) / maximum(1.0 - wall * part, 1e-3), (*other_s, zero), other_row)
     mean = floor * floor_row.brightness + wall * wall_row.brightness + sky * arena.sky
     beside = jnp.where(on_edge, floor_row.brightness, jnp.where(sky > 0, arena.sky, other_row.brightness))
-    return _Room(
-        first=choose(floor_first, as_floor, as_wall),
-        second=choose(floor_first, as_wall, choose(on_edge, as_floor, as_other)),
+    return _RoomLayers(
+        first=tree_where(floor_first, as_floor, as_wall),
+        second=tree_where(floor_first, as_wall, tree_where(on_edge, as_floor, as_other)),
         behind_one=arena.sky,
         behind_two=jnp.where(floor_first, wall_row.brightness, beside),
         behind_three=mean,
     )
 
 
-def _walls(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
-    """Tell whether a wall in x is met before one in y, and s of both."""
-    low, high = eye[:2] - arena.room[0::2], arena.room[1::2] - eye[:2]
-    forth, back = 1.0 / maximum(high, NEAR), -1.0 / maximum(low, NEAR)
-    s_x, s_y = jnp.where(d[0] > 0, forth[0], back[0]), jnp.where(d[1] > 0, forth[1], back[1])
+def _wall_faces(arena: Arena, eye: Array, d: Vector) -> tuple[Array, Pair, Pair]:
+    """Return whether a ray meets a wall in x before one in y, and s of both walls."""
+    low, high = eye[:2] - arena.bounds[0::2], arena.bounds[1::2] - eye[:2]
+    forward, backward = 1.0 / maximum(high, MIN_DISTANCE), -1.0 / maximum(low, MIN_DISTANCE)
+    s_x, s_y = jnp.where(d[0] > 0, forward[0], backward[0]), jnp.where(d[1] > 0, forward[1], backward[1])
     zero = jnp.zeros_like(s_x)
     return s_x * d[0] > s_y * d[1], (s_x, zero), (zero, s_y)
 
 
-def _part_of_nearer(wall: Pair, other: Pair, pixels: antialiasing.Rays) -> tuple[Array, Pair]:
-    """Part of a pixel that the nearer of two walls has, the rest being round the corner, and the way to more of it."""
-    return antialiasing.part_and_way(antialiasing.slopes((wall[0] - other[0], wall[1] - other[1]), pixels))
+def _coverage_of_nearer(wall: Pair, other: Pair, rays: PixelRays) -> tuple[Array, Pair]:
+    """Return the part of a pixel that the nearer of two walls covers, and the direction in which it grows.
+
+    The rest of the pixel is beyond the corner.
+    """
+    return antialiasing.edge_coverage_and_direction(
+        antialiasing.inverse_depth((wall[0] - other[0], wall[1] - other[1]), rays)
+    )
 
 
-def _shade(handedness: Array, eye: Array, pixels: antialiasing.Rays, layer: Layer, bands: int) -> Array:
-    """Grey of a layer where the rays meet it, averaged over the pixel."""
-    d, s = pixels.d, layer.s
-    t = antialiasing.once(1.0 / maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _FAR))
+def _room_textures(arena: Arena, d: Vector, by_x: Array) -> tuple[Texture, Texture, Texture]:
+    """Return the textures of the wall that a ray meets, of the other wall, and of the floor."""
+    rows = texture.prepare(arena.wall_texture)
+    x_row, y_row = (tree_where(d[i] > 0, _row(rows, 2 * i + 1), _row(rows, 2 * i)) for i in (0, 1))
+    wall_row, other_row = tree_where(by_x, x_row, y_row), tree_where(by_x, y_row, x_row)
+    return wall_row, other_row, texture.prepare(arena.floor_texture)
+
+
+def _shade(handedness: Array, eye: Array, rays: PixelRays, layer: Layer, bands: int) -> Array:
+    """Return the grey of a layer where the rays meet it, averaged over the pixel."""
+    d, s = rays.d, layer.s
+    t = fusion.fusible(1.0 / maximum(s[0] * d[0] + s[1] * d[1] + s[2] * d[2], 1.0 / _MAX_DEPTH))
     scaled = t * layer.texture.frequency
 
-    def step(change: Vector) -> Vector:
-        # The hit moves aside with the ray, and along it by the slant of the surface.
-        slant = (s[0] * change[0] + s[1] * change[1] + s[2] * change[2]) * t
-        x, y, z = (scaled * (change[i] - d[i] * slant) for i in range(3))
+    def displacement(change: Vector) -> Vector:
+        # The hit moves sideways with the ray, and along the ray by the inclination of the surface.
+        inclination = (s[0] * change[0] + s[1] * change[1] + s[2] * change[2]) * t
+        x, y, z = (scaled * (change[i] - d[i] * inclination) for i in range(3))
         return x, y * handedness, z
 
-    centre_x, centre_y = layer.centre
+    origin_x, origin_y = layer.texture_origin
     f = layer.texture.frequency
-    point = (d[0] * t - centre_x) * f, (d[1] * t - centre_y) * f * handedness, (d[2] * t + eye[2]) * f
-    across, down = step(pixels.d_u), step(pixels.d_v)
-    u, v = layer.shift
+    point = (d[0] * t - origin_x) * f, (d[1] * t - origin_y) * f * handedness, (d[2] * t + eye[2]) * f
+    across, down = displacement(rays.d_u), displacement(rays.d_v)
+    u, v = layer.centroid
     x, y, z = (p + u * a + v * b for p, a, b in zip(point, across, down, strict=True))
     width, height = 1.0 - 2.0 * jnp.abs(u), 1.0 - 2.0 * jnp.abs(v)
-    return texture.grey(layer.texture, (x, y, z), _times(width, across), _times(height, down), bands)
+    return texture.grey_level(layer.texture, (x, y, z), _scale(width, across), _scale(height, down), bands)
 
 
-def _times(factor: Array, vector: Vector) -> Vector:
+def _scale(factor: Array, vector: Vector) -> Vector:
     return factor * vector[0], factor * vector[1], factor * vector[2]
 
 
-def choose(condition: Array, a: Arrays, b: Arrays) -> Arrays:
-    """`where` over tuples of arrays."""
+def tree_where(condition: Array, a: Tree, b: Tree) -> Tree:
+    """Apply `jnp.where` to every leaf of two trees of one structure."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 

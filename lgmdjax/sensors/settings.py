@@ -5,14 +5,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """Pictures of width x height pixels an eye, of which each LGMD gets the part `overlap` on its side.
+    """Image size per eye, and how the LGMD of each side samples it.
 
-    Its cells look at `pooling` pixels a side: about 6 degrees at every scale. The two share no column of the picture:
-    what both eyes see, which is what stands straight ahead, far off, tells neither side from the other
-    (`experiments/overlap.py`).
+    A cell averages `pooling` x `pooling` pixels, about 6 degrees at every scale. With the default `overlap` the two
+    LGMDs share no column of the images: both eyes see what is straight ahead and far away, and it does not tell the
+    sides apart (`lgmdjax.studies.overlap`).
     """
 
     width: int
+    """px"""
     height: int
+    """px"""
     overlap: float = 0.5
+    """Fraction of the width that each LGMD receives, from its own side."""
     pooling: int = 1
+    """px"""

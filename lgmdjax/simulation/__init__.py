@@ -1,1 +1,5 @@
 """Robots in rooms: one frame, many frames, many robots, and recordings of them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,113 +1,141 @@
-"""What the stages share: one robot put together from the files of a run, and walks of a crowd with a progress bar."""
+"""Robots assembled from the files of a run, or from those of the package."""
 
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lgmdjax.control import braitenberg, navigator, policies
+from lgmdjax.control.names import POLICY_NAMES, PolicyName
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.locomotion import shaping
-from lgmdjax.paths import PRETRAINED
+from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.runtime.storage import read_arrays, read_json
 from lgmdjax.sensors import camera
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import closed_loop
 
+REPLAY_LENGTH = 4096  # velocities of policy random; static, so that one compiled program serves all stages
+CALIBRATED = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
 
-def eyes(settings: CameraSettings) -> camera.Params:
-    """Set up the stereo camera of a run."""
+
+def camera_params(settings: CameraSettings) -> camera.Params:
+    """Return the stereo camera of these settings."""
     return camera.Params(width=settings.width, height=settings.height, overlap=settings.overlap)
 
 
-def robot(gait: Path, settings: CameraSettings, detector: lgmd.Params, crew: policies.Anyone) -> closed_loop.Params:
-    """Put a robot together: the gait that was fitted, the eyes of the run, and anyone at the wheel."""
-    networks = shaping.load(gait / "shaping.safetensors")
-    params = closed_loop.assemble(crew, detector=detector, networks=networks, eyes=eyes(settings))
-    return with_eyes(params, settings)
+def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAINED_DIR) -> closed_loop.Params:
+    """Return the robot of a run, with all five policies and the camera of its training; by default the pretrained one.
 
-
-def trained(gait: Path = PRETRAINED, train: Path = PRETRAINED) -> closed_loop.Params:
-    """Put a robot together from two folders, all five drivers aboard, with the eyes that its navigator learned from.
+    >>> robot = load_robot()
+    >>> robot.camera.width, robot.camera.height
+    (80, 60)
 
     Args:
-        gait: the folder of stage fit-gait. train: that of stage train. Left out, it is the robot that comes along.
+        gait_folder: the folder of stage fit-gait.
+        train_folder: the folder of stage train.
 
-    Raises InputError if a folder has not what the stage writes.
+    Raises InputError if a folder lacks the files of its stage.
     """
-    learned, header = navigator.load(train / "controller.safetensors")
-    baselines = read_arrays(train / "baselines.npz")
+    navigator_params, header = navigator.load(train_folder / "controller.safetensors")
+    baselines = read_arrays(train_folder / "baselines.npz")
     try:
-        crew = everyone(learned, float(baselines["gain"]), baselines["replayed"])
-        return robot(gait, CameraSettings(**header["eyes"]), lgmd.Params(**header["lgmd"]), crew)
+        switch = make_policies(navigator_params, float(baselines["gain"]), baselines["replayed"])
+        return assemble_robot(gait_folder, CameraSettings(**header["eyes"]), lgmd.Params(**header["lgmd"]), switch)
     except (KeyError, TypeError) as error:
         raise InputError(
-            f"{train}: expected a navigator and baselines as `lgmdjax train` leaves them, got {error}; train again"
+            f"{train_folder}: expected files as `lgmdjax train` writes them, got {error}; train again"
         ) from error
 
 
-def with_eyes(params: closed_loop.Params, settings: CameraSettings) -> closed_loop.Params:
-    """Give a robot other eyes; whose cells look at as much of the world say nearly the same."""
-    detector = replace(params.controller.lgmd, pooling=settings.pooling)
-    return replace(params, camera=eyes(settings), controller=replace(params.controller, lgmd=detector))
+def assemble_robot(
+    gait_folder: Path,
+    camera_settings: CameraSettings,
+    lgmd_params: lgmd.Params,
+    policy_params: policies.PolicySwitch,
+) -> closed_loop.Params:
+    """Return a robot with the fitted gait of a run, and the given camera, detector and policies."""
+    params = closed_loop.assemble(
+        policy_params,
+        lgmd_params=lgmd_params,
+        shaping_params=shaping.load(gait_folder / "shaping.safetensors"),
+        camera_params=camera_params(camera_settings),
+    )
+    return with_camera(params, camera_settings)
 
 
-def everyone(
-    learned: navigator.Params | None = None, gain: float = 0.0, replayed: np.ndarray | None = None
-) -> policies.Anyone:
-    """Seat all five drivers, the teacher at the wheel; those that nothing is known of yet are stand-ins.
+def make_policies(
+    navigator_params: navigator.Params | None = None,
+    direct_gain: float = 0.0,
+    replay_velocities: np.ndarray | None = None,
+) -> policies.PolicySwitch:
+    """Return all five policies, the teacher active; what is not given yet gets a placeholder.
 
     Args:
-        learned: the trained navigator. gain: of the direct driver [1/m].
-        replayed: `REPLAY` commands of the teacher for the random driver.
+        navigator_params: the trained navigator; untrained if None.
+        direct_gain: gain of policy direct [1/m].
+        replay_velocities: `REPLAY_LENGTH` velocities of the teacher for policy random; constant if None.
     """
     teacher = braitenberg.Params()
     straight = jnp.full(2, teacher.base, dtype=float)
-    commands = jnp.broadcast_to(straight, (REPLAY, 2)) if replayed is None else jnp.asarray(replayed, dtype=float)
-    return policies.Anyone(
-        seat=jnp.asarray(0),
-        drivers=(
+    if replay_velocities is None:
+        velocities = jnp.broadcast_to(straight, (REPLAY_LENGTH, 2))
+    else:
+        velocities = jnp.asarray(replay_velocities, dtype=float)
+    return policies.PolicySwitch(
+        active=jnp.asarray(0),
+        policies=(
             teacher,
-            navigator.create(jax.random.key(0), symmetric=True) if learned is None else learned,
-            policies.Blind(velocity=straight),
-            policies.Direct(rule=teacher, gain=jnp.asarray(gain, dtype=float)),
-            policies.Replay(velocities=commands),
+            navigator.create(jax.random.key(0), symmetric=True) if navigator_params is None else navigator_params,
+            policies.BlindParams(velocity=straight),
+            policies.DirectParams(rule=teacher, gain=jnp.asarray(direct_gain, dtype=float)),
+            policies.ReplayParams(velocities=velocities),
         ),
     )
 
 
-REPLAY = 4096  # commands of the random driver; a static number, so that one compiled program serves all stages
+def with_camera(params: closed_loop.Params, settings: CameraSettings) -> closed_loop.Params:
+    """Return the robot with another camera.
+
+    `settings.pooling` keeps the visual angle of an LGMD cell, so that its responses change little.
+    """
+    lgmd_params = replace(params.controller.lgmd, pooling=settings.pooling)
+    return replace(params, camera=camera_params(settings), controller=replace(params.controller, lgmd=lgmd_params))
 
 
-def manned(params: closed_loop.Params, driver: Any) -> closed_loop.Params:
-    """Exchange one of a robot's five drivers, the one whose parameters are of the same type."""
-    crew = params.controller.driver
-    five = tuple(driver if isinstance(one, type(driver)) else one for one in crew.drivers)
-    return replace(params, controller=replace(params.controller, driver=replace(crew, drivers=five)))
+def with_policy(params: closed_loop.Params, name: PolicyName, policy_params: PyTree) -> closed_loop.Params:
+    """Return the robot with other parameters of one of its five policies.
+
+    Args:
+        params: a robot whose controller has a `policies.PolicySwitch`.
+        name: name of the policy to change.
+        policy_params: its new parameters, of the same type as before.
+    """
+    switch: policies.PolicySwitch = params.controller.policy
+    index = POLICY_NAMES.index(name)
+    switch = replace(switch, policies=(*switch.policies[:index], policy_params, *switch.policies[index + 1 :]))
+    return replace(params, controller=replace(params.controller, policy=switch))
 
 
-def seat(params: closed_loop.Params, driver: policies.Driver) -> closed_loop.Params:
-    """Put one of the drivers at the wheel."""
-    crew = replace(params.controller.driver, seat=jnp.asarray(policies.ALL.index(driver)))
-    return replace(params, controller=replace(params.controller, driver=crew))
+def select_policy(params: closed_loop.Params, policy: policies.Policy) -> closed_loop.Params:
+    """Return the robot with this policy active."""
+    switch = replace(params.controller.policy, active=jnp.asarray(policies.POLICIES.index(policy)))
+    return replace(params, controller=replace(params.controller, policy=switch))
 
 
-def digest(params: closed_loop.Params) -> str:
-    """Tell a robot from any other."""
+def fingerprint(params: closed_loop.Params) -> str:
+    """Return a hash of all parameters of a robot and their structure."""
     leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)]
     structure = repr((params.camera, jax.tree.structure(params))).encode()
     return hashlib.sha256(b"".join(leaves) + structure).hexdigest()[:16]
 
 
-CHOSEN = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
-
-
 def load_detector(folder: Path) -> lgmd.Params:
-    """Read the detector that `collect` calibrated."""
-    chosen = read_json(folder / "calibration.json")
-    return lgmd.Params(**{name: chosen[name] for name in CHOSEN})
+    """Return the LGMD that stage collect calibrated, from its folder."""
+    calibration = read_json(folder / "calibration.json")
+    return lgmd.Params(**{name: calibration[name] for name in CALIBRATED})

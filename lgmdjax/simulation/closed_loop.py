@@ -1,149 +1,160 @@
-"""One robot, one camera frame: sense, decide, move.
+"""The closed loop: one robot, one camera frame. Reset, observe, decide, move.
 
-A frame draws what both eyes see from where the robot stands, scans with the laser, shows the pictures to the
-LGMDs, lets the driver choose a velocity and the rule label the frame, and then runs the rhythm, the servos and
-the body for the physics substeps of 1/30 s. Everything is a pure function of (parameters, room, state): a walk
-is a `lax.scan` over `step`, that of a crowd one over its `vmap` (`lgmdjax.simulation.rollout`).
+In each frame of 1/30 s a robot
 
-A touch of a wall or an obstacle ends a stretch: the next frame begins with the robot set back at the room's next
-start, as an experimenter would lift it, so that one walk can count several collisions. A robot whose state is
-not finite, or that fell over, is frozen where it was and flagged by `ok`; nothing here raises.
+1. renders both cameras from its present pose, scans with the laser, and steps the LGMDs,
+2. lets the policy choose a velocity, and the teacher label the frame,
+3. runs CPG, servos and physics for `SUBSTEPS` steps.
+
+Everything is a pure function of (parameters, room, state): a rollout is a `lax.scan` over `step`, that of a batch a
+scan over its `vmap` (`lgmdjax.simulation.rollout`).
+
+After contact with a wall or an obstacle the next frame begins with a reset to the room's next start, as an experimenter
+would lift the robot, so that one rollout can count several collisions. A robot that fell over, or whose state is not
+finite, is frozen and flagged by `ok`; nothing here raises.
 """
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
-from mujoco import mjx
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, controller
-from lgmdjax.control.policies import Driver, Senses
+from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
 from lgmdjax.locomotion import cpg, shaping
+from lgmdjax.runtime.mjx import mjx
 from lgmdjax.sensors import camera, laser
 from lgmdjax.world import arena
 
-Leaf = Array | np.ndarray
-Through = Literal[
-    "controller", "nerves", "everything"
-]  # what a derivative passes (`lgmdjax.learning.rollout_gradient`)
-FRAME_RATE = 30.0  # Hz, the camera's (paper sec. 3.1)
-SUBSTEPS = 6  # physics steps a frame; the robot's XML has the time step that makes them fill it
+Tree = TypeVar("Tree")
+AnyArray = Array | np.ndarray
+
+GradPath = Literal["controller", "body", "everything"]
+"""What a gradient passes through: the policy alone, also the body and the label, or also the camera and the LGMDs."""
+
+FRAME_RATE = 30.0  # Hz, of the camera (paper sec. 3.1)
+SUBSTEPS = 6  # physics steps a frame; the time step in the robot's XML is 1 / (FRAME_RATE * SUBSTEPS)
 
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """What a robot is made of, beside its body: senses, nervous system, and the rule that labels its frames."""
+    """Parameters of a robot, beside its body: controller, teacher, and sensors."""
 
     controller: controller.Params
-    teacher: braitenberg.Params
+    teacher: braitenberg.Params  # of the rule that labels the frames
     camera: camera.Params
     laser: laser.Params
-    every: Int[Array, ""] | None = None  # frames from one picture to the next, 1 if None; u stands in between
-    sway: Float[Array, ""] | None = None  # of the head, as a multiple of the trunk's, 1 if None
+    frame_stride: Int[Array, ""] | None = None  # frames from one picture to the next, 1 if None; u is held in between
+    head_sway: Float[Array, ""] | None = None  # sway of the head, as a multiple of the trunk's, 1 if None
 
 
 @struct.dataclass(kw_only=True)
 class Room:
-    """Where a robot walks: the obstacles, and the poses (x, y, yaw) at which it is put down, in order."""
+    """A room with the poses (x, y, yaw) at which its robot starts, in order."""
 
     arena: arena.Arena
     starts: Float[Array, "starts 3"]
-    key: Array  # the luck of a driver that has some
+    key: Array  # random key of the policy
 
 
 @struct.dataclass(kw_only=True)
 class State:
-    """One robot in one room between two frames."""
+    """State of one robot in one room between two frames."""
 
     data: mjx.Data
     controller: controller.State
     teacher: braitenberg.State
-    response: lgmd.Response  # to the last picture, of two eyes
-    frame: Int[Array, ""]  # frames since the start
-    setbacks: Int[Array, ""]  # times that it was put down again
-    fresh: Bool[Array, ""]  # just put down: the eyes have no last picture yet
-    touched: Bool[Array, ""]  # hit something in the last frame
-    ok: Bool[Array, ""]  # finite and on its feet
+    response: lgmd.Response  # of both LGMDs to the last picture
+    frame: Int[Array, ""]  # frames since the start of the rollout
+    resets: Int[Array, ""]  # number of resets so far
+    is_first: Bool[Array, ""]  # first frame after a start or reset: there is no picture to compare with
+    contact: Bool[Array, ""]  # touched something in the last frame
+    ok: Bool[Array, ""]  # finite and not fallen
 
 
 @struct.dataclass(kw_only=True)
 class Record:
-    """What one frame leaves behind; the pose is the one from which the pictures were drawn. NumPy's on the host."""
+    """What is recorded of one frame, or of many: `axes` are then (frame) or (robot, frame).
 
-    time: Float[Leaf, ""]  # s
-    position: Float[Leaf, "3"]  # m
-    quaternion: Float[Leaf, "4"]  # w x y z
-    joints: Float[Leaf, "6 3"]  # rad
-    u: Float[Leaf, "2"]
-    feed_forward: Float[Leaf, "2"]  # grey
-    excitation: Float[Leaf, "2"]  # grey, U / n_cell
-    distances: Float[Leaf, "2"]  # m
-    label: Float[Leaf, "2"]  # the teacher's velocity
-    velocity: Float[Leaf, "2"]  # the driver's velocity
-    clearance: Float[Leaf, ""]  # m, the least within the frame
-    contact: Bool[Leaf, ""]  # clearance <= 0 in some substep
-    fresh: Bool[Leaf, ""]
-    setbacks: Int[Leaf, ""]
-    ok: Bool[Leaf, ""]
+    The pose is that from which the pictures were rendered. Records on the host hold NumPy arrays.
+    """
+
+    time: Float[AnyArray, "*axes"]  # s, since the start of the rollout
+    position: Float[AnyArray, "*axes 3"]  # m, of the trunk
+    quaternion: Float[AnyArray, "*axes 4"]  # w x y z
+    joints: Float[AnyArray, "*axes 6 3"]  # rad
+    u: Float[AnyArray, "*axes 2"]
+    feed_forward: Float[AnyArray, "*axes 2"]  # grey
+    excitation: Float[AnyArray, "*axes 2"]  # grey, U / n_cell
+    distances: Float[AnyArray, "*axes 2"]  # m
+    label: Float[AnyArray, "*axes 2"]  # velocity of the teacher, nominal
+    velocity: Float[AnyArray, "*axes 2"]  # velocity of the policy, nominal
+    clearance: Float[AnyArray, "*axes"]  # m, smallest within the frame
+    contact: Bool[AnyArray, "*axes"]  # clearance <= 0 in some substep
+    is_first: Bool[AnyArray, "*axes"]  # first frame after a start or reset
+    resets: Int[AnyArray, "*axes"]  # number of resets so far
+    ok: Bool[AnyArray, "*axes"]  # finite and not fallen
 
 
 def assemble(
-    driver: Any,
+    policy_params: PyTree,
     *,
-    detector: lgmd.Params | None = None,
-    rhythm: cpg.Params | None = None,
-    networks: shaping.Params | None = None,
-    teacher: braitenberg.Params | None = None,
-    eyes: camera.Params | None = None,
-    scanner: laser.Params | None = None,
+    lgmd_params: lgmd.Params | None = None,
+    cpg_params: cpg.Params | None = None,
+    shaping_params: shaping.Params | None = None,
+    teacher_params: braitenberg.Params | None = None,
+    camera_params: camera.Params | None = None,
+    laser_params: laser.Params | None = None,
 ) -> Params:
-    """Put a robot together from its driver's parameters and whatever else is not the default.
+    """Assemble a robot from the parameters of its policy and of all components that are not the default.
 
-    Plain numbers become arrays, so that a program compiled for some values serves all, and can be differentiated in
-    them. The default networks are those that come with the package (`shaping.taught`).
+    Plain numbers become arrays, so that one compiled program serves all values and can be differentiated by them. The
+    default shaping networks are those of the package (`shaping.load_pretrained`).
 
-    Raises InputError for numbers without sense (the components' `check`), unless some are being traced.
+    Raises InputError for invalid numbers (`check` of the components), unless some are traced.
     """
-    nerves = controller.Params(
-        lgmd=detector or lgmd.Params(),
-        driver=driver,
-        cpg=rhythm or cpg.Params(),
-        shaping=networks or shaping.taught(),
+    controller_params = controller.Params(
+        lgmd=lgmd_params or lgmd.Params(),
+        policy=policy_params,
+        cpg=cpg_params or cpg.Params(),
+        shaping=shaping_params or shaping.load_pretrained(),
     )
     params = Params(
-        controller=nerves,
-        teacher=teacher or braitenberg.Params(),
-        camera=eyes or camera.Params(),
-        laser=scanner or laser.Params(),
+        controller=controller_params,
+        teacher=teacher_params or braitenberg.Params(),
+        camera=camera_params or camera.Params(),
+        laser=laser_params or laser.Params(),
     )
     if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
-        lgmd.check(nerves.lgmd)
-        cpg.check(nerves.cpg)
+        lgmd.check(controller_params.lgmd)
+        cpg.check(controller_params.cpg)
         braitenberg.check(params.teacher)
         laser.check(params.laser)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if np.isscalar(leaf) else leaf, params)
 
 
-def init(params: Params, model: mjx.Model, room: Room, driver: Driver) -> State:
-    """Put a robot down at the room's first start, with its rhythm settled and its eyes about to open."""
-    dark = jnp.zeros(camera.shape(params.camera))
+def init(params: Params, model: mjx.Model, room: Room, policy: Policy) -> State:
+    """Return the state of a robot at the room's first start, its CPG on the limit cycle, before the first picture."""
+    black = jnp.zeros(camera.image_shape(params.camera))
     return State(
-        data=hexapod.reset(model, room.starts[0]),
-        controller=controller.init(params.controller, dark, driver, room.key),
+        data=hexapod.init(model, room.starts[0]),
+        controller=controller.init(params.controller, black, policy, room.key),
         teacher=braitenberg.init(params.teacher),
-        response=lgmd.Response(u=jnp.full(2, lgmd.STILL, float), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2)),
+        response=lgmd.Response(
+            u=jnp.full(2, lgmd.U_AT_REST, float), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2)
+        ),
         frame=jnp.asarray(0, jnp.int32),
-        setbacks=jnp.asarray(0, jnp.int32),
-        fresh=jnp.asarray(True),
-        touched=jnp.asarray(False),
+        resets=jnp.asarray(0, jnp.int32),
+        is_first=jnp.asarray(True),
+        contact=jnp.asarray(False),
         ok=jnp.asarray(True),
     )
 
@@ -153,155 +164,158 @@ def step(
     model: mjx.Model,
     room: Room,
     state: State,
-    driver: Driver,
-    draw: Bool[Array, ""] | bool = True,
-    through: Through = "everything",
+    policy: Policy,
+    *,
+    render: Bool[Array, ""] | bool = True,
+    grad_path: GradPath = "everything",
 ) -> tuple[State, Record]:
-    """Run one frame: set back if it touched, sense, decide, move.
+    """Run one frame: reset after contact, observe, decide, move.
 
-    Without `draw` the eyes stay shut and see black (u = 0.5): for drivers that do not look, in walks whose pictures
-    nobody wants.
+    Without `render` the pictures are black (u = 0.5), for policies that do not use the camera.
 
-    Gradient: by all that `through` names. With "nerves", what the eyes say is held; with "controller", the label and
-    the body too.
+    Gradient: through all that `grad_path` names. With "body" the pictures and the LGMDs' responses are held constant;
+    with "controller" also the label, the distances and the body.
     """
-    state = set_back(params, room, state, driver)
-    scene = arena.at(room.arena, state.frame / FRAME_RATE)
-    state, senses = sense(params, scene, state, draw)
-    if through != "everything":
-        state, senses = _eyes_held(state, senses)
-    state, label = decide(params, state, senses, driver)
-    walker = (params, state)
-    if through == "controller":
-        label, walker = jax.lax.stop_gradient((label, walker))
-    moved, clearance = move(walker[0], model, scene, walker[1])
+    state = reset(params, room, state, policy)
+    scene = arena.at_time(room.arena, state.frame / FRAME_RATE)
+    state, observation = observe(params, scene, state, render)
+    if grad_path != "everything":
+        state, observation = _hold_vision(state, observation)
+    state, label = decide(params, state, observation, policy)
+    mover = (params, state)
+    if grad_path == "controller":
+        label, mover = jax.lax.stop_gradient((label, mover))
+    moved, clearance = move(mover[0], model, scene, mover[1])
     moved = replace(moved, controller=replace(state.controller, cpg=moved.controller.cpg))
-    record = _record(state, senses, label, clearance)
-    return _keep_sound(state, moved), record
+    record = _record(state, observation, label, clearance)
+    return _freeze_unhealthy(state, moved), record
 
 
-def _eyes_held(state: State, senses: Senses) -> tuple[State, Senses]:
-    """Take what the eyes saw and said for given."""
-    eyes, response = jax.lax.stop_gradient((state.controller.lgmd, state.response))
-    held = replace(state, controller=replace(state.controller, lgmd=eyes), response=response)
-    said = {name: jax.lax.stop_gradient(getattr(senses, name)) for name in ("u", "feed_forward", "excitation")}
-    return held, replace(senses, **said)
+def _hold_vision(state: State, observation: Observation) -> tuple[State, Observation]:
+    """Stop the gradient through pictures and responses of the LGMDs."""
+    lgmd_state, response = jax.lax.stop_gradient((state.controller.lgmd, state.response))
+    held = replace(state, controller=replace(state.controller, lgmd=lgmd_state), response=response)
+    outputs = {name: jax.lax.stop_gradient(getattr(observation, name)) for name in ("u", "feed_forward", "excitation")}
+    return held, replace(observation, **outputs)
 
 
-def set_back(params: Params, room: Room, state: State, driver: Driver) -> State:
-    """Put a robot that touched something down at the room's next start, driver and rule as new, the rhythm going on."""
-    setbacks = state.setbacks + 1
-    start = jnp.take(room.starts, setbacks, axis=0, mode="wrap")
-    fresh_driver = driver.init(params.controller.driver, jax.random.fold_in(room.key, setbacks))
-    lifted = replace(
+def reset(params: Params, room: Room, state: State, policy: Policy) -> State:
+    """Reset a robot that had contact to the room's next start, with new policy and teacher states; the CPG goes on."""
+    resets = state.resets + 1
+    start = jnp.take(room.starts, resets, axis=0, mode="wrap")
+    policy_state = policy.init(params.controller.policy, jax.random.fold_in(room.key, resets))
+    at_start = replace(
         state,
-        data=hexapod.put(state.data, start),
-        controller=replace(state.controller, driver=fresh_driver),
+        data=hexapod.reset(state.data, start),
+        controller=replace(state.controller, policy=policy_state),
         teacher=braitenberg.init(params.teacher),
-        setbacks=setbacks,
-        fresh=jnp.ones_like(state.fresh),
+        resets=resets,
+        is_first=jnp.ones_like(state.is_first),
     )
-    return _where(state.touched, lifted, state)
+    return _where(state.contact, at_start, state)
 
 
-def sense(
-    params: Params, scene: arena.Arena, state: State, draw: Bool[Array, ""] | bool = True
-) -> tuple[State, Senses]:
-    """Look and scan from where the robot stands; the LGMDs (eqs. 7-16) see the left and right hemifield."""
+def observe(
+    params: Params, scene: arena.Arena, state: State, render: Bool[Array, ""] | bool = True
+) -> tuple[State, Observation]:
+    """Render, scan, and step the LGMDs (eqs. 7-16); return the observation from the robot's present pose."""
     pose = hexapod.pose(state.data)
-    distances = laser.hemifields(laser.scan(params.laser, scene, *hexapod.laser_pose(pose)))
-    nerves = state.controller
+    distances = laser.hemifield_distances(laser.scan(params.laser, scene, *hexapod.laser_pose(pose)))
 
-    head = pose if params.sway is None else hexapod.swaying(pose, params.sway)
-    frames = look(params.camera, scene, head, draw)
-    opened = _where(state.fresh, controller.open_eyes(params.controller, frames), nerves.lgmd)
-    nerves, response = controller.see(params.controller, replace(nerves, lgmd=opened), frames)
-    if params.every is not None:
-        looks = state.fresh | (state.frame % params.every == 0)
-        nerves, response = _where(looks, (nerves, response), (state.controller, state.response))
-    senses = Senses(
+    head = pose if params.head_sway is None else hexapod.scale_tilt(pose, params.head_sway)
+    frames = render_stereo(params.camera, scene, head, render)
+    started = controller.init_lgmd(params.controller, frames)
+    before = replace(state.controller, lgmd=_where(state.is_first, started, state.controller.lgmd))
+    controller_state, response = controller.detect(params.controller, before, frames)
+    if params.frame_stride is not None:
+        has_picture = state.is_first | (state.frame % params.frame_stride == 0)
+        new, old = (controller_state, response), (state.controller, state.response)
+        controller_state, response = _where(has_picture, new, old)
+    observation = Observation(
         u=response.u, feed_forward=response.feed_forward, excitation=response.excitation, distances=distances
     )
-    return replace(state, controller=nerves, response=response), senses
+    return replace(state, controller=controller_state, response=response), observation
 
 
-def look(
-    eyes: camera.Params, scene: arena.Arena, pose: hexapod.Pose, draw: Bool[Array, ""] | bool = True
+def render_stereo(
+    camera_params: camera.Params, scene: arena.Arena, pose: hexapod.Pose, render: Bool[Array, ""] | bool = True
 ) -> Float[Array, "2 height columns"]:
-    """Draw what both eyes see from a pose of the trunk, in grey levels 0..255; black without `draw`.
+    """Render both cameras from a pose of the trunk, in grey levels 0..255; black without `render`.
 
-    The choice is made at run time, also where it is known before, so that the drawing is compiled by itself. XLA would
-    else draw anew inside each of the loops that read the picture, and round differently in each program. Given as an
-    array, one program serves walks with and without pictures.
+    Whether to render is decided at run time even where it is known before, so that rendering is compiled separately.
+    Otherwise XLA would render again inside each loop that reads the picture, with other rounding in each program. If
+    `render` is an array, one compiled program serves rollouts with and without pictures.
     """
-    dark = jnp.zeros(camera.shape(eyes), pose.position.dtype)
-    if draw is False:
-        return dark
-    unknown = jax.lax.optimization_barrier(jnp.asarray(draw))
-    return jax.lax.cond(unknown, lambda: camera.render(eyes, scene, *hexapod.eye_poses(pose)), lambda: dark)
+    black = jnp.zeros(camera.image_shape(camera_params), pose.position.dtype)
+    if render is False:
+        return black
+    unknown = jax.lax.optimization_barrier(jnp.asarray(render))
+    return jax.lax.cond(unknown, lambda: camera.render(camera_params, scene, *hexapod.eye_poses(pose)), lambda: black)
 
 
-def decide(params: Params, state: State, senses: Senses, driver: Driver) -> tuple[State, Float[Array, "2"]]:
-    """Let the driver choose the velocity, and the rule (eq. 22, limited) label the frame."""
-    _, label = braitenberg.step(params.teacher, state.teacher, senses.distances)
-    nerves = controller.decide(params.controller, state.controller, senses, driver)
-    teacher = braitenberg.watch(params.teacher, nerves.velocity)
-    return replace(state, controller=nerves, teacher=teacher), label
+def decide(params: Params, state: State, observation: Observation, policy: Policy) -> tuple[State, Float[Array, "2"]]:
+    """Let the policy choose the velocity; return also the teacher's velocity (eq. 22, limited), the label."""
+    _, label = braitenberg.step(params.teacher, state.teacher, observation.distances)
+    controller_state = controller.decide(params.controller, state.controller, observation, policy)
+    teacher = braitenberg.track_turn(params.teacher, controller_state.velocity)
+    return replace(state, controller=controller_state, teacher=teacher), label
 
 
 def move(params: Params, model: mjx.Model, scene: arena.Arena, state: State) -> tuple[State, Float[Array, ""]]:
-    """Run rhythm, servos and body to the next frame; return the least clearance [m] on the way."""
-    model = hexapod.place_obstacles(model, scene, state.data)
+    """Run CPG, servos and physics until the next frame; return also the smallest clearance [m] within it."""
+    model = hexapod.place_barriers(model, scene, state.data)
     interval = 1 / (FRAME_RATE * SUBSTEPS)
 
-    @partial(jax.checkpoint, prevent_cse=False)  # to keep its inside for the way back would take longer
-    def substep(carry, _):
-        data, nerves = carry
-        nerves, targets = controller.move(params.controller, nerves, interval)
+    @partial(jax.checkpoint, prevent_cse=False)  # storing its intermediates for the backward pass would take longer
+    def substep(
+        carry: tuple[mjx.Data, controller.State], _: None
+    ) -> tuple[tuple[mjx.Data, controller.State], Float[Array, ""]]:
+        data, controller_state = carry
+        controller_state, targets = controller.move(params.controller, controller_state, interval)
         data = hexapod.substep(model, data, targets)
         clearance = jnp.min(arena.clearance(scene, *hexapod.capsules(model, data)))
-        return (data, nerves), clearance
+        return (data, controller_state), clearance
 
-    (data, nerves), clearances = jax.lax.scan(substep, (state.data, state.controller), length=SUBSTEPS)
+    (data, controller_state), clearances = jax.lax.scan(substep, (state.data, state.controller), length=SUBSTEPS)
     clearance = jnp.min(clearances)
     state = replace(
         state,
         data=data,
-        controller=nerves,
+        controller=controller_state,
         frame=state.frame + 1,
-        fresh=jnp.zeros_like(state.fresh),
-        touched=clearance <= 0,
+        is_first=jnp.zeros_like(state.is_first),
+        contact=clearance <= 0,
     )
     return state, clearance
 
 
-def _record(state: State, senses: Senses, label: Float[Array, "2"], clearance: Float[Array, ""]) -> Record:
+def _record(state: State, observation: Observation, label: Float[Array, "2"], clearance: Float[Array, ""]) -> Record:
     pose = hexapod.pose(state.data)
     return Record(
         time=state.frame / FRAME_RATE,
         position=pose.position,
         quaternion=pose.quaternion,
-        joints=hexapod.joints(state.data),
-        u=senses.u,
-        feed_forward=senses.feed_forward,
-        excitation=senses.excitation,
-        distances=senses.distances,
+        joints=hexapod.joint_angles(state.data),
+        u=observation.u,
+        feed_forward=observation.feed_forward,
+        excitation=observation.excitation,
+        distances=observation.distances,
         label=label,
         velocity=state.controller.velocity,
         clearance=clearance,
         contact=clearance <= 0,
-        fresh=state.fresh,
-        setbacks=state.setbacks,
+        is_first=state.is_first,
+        resets=state.resets,
         ok=state.ok,
     )
 
 
-def _keep_sound(before: State, after: State) -> State:
-    """Freeze a robot that fell or went non-finite at its last sound frame, for good; only the clock goes on."""
-    ok = before.ok & hexapod.is_sound(after.data)
+def _freeze_unhealthy(before: State, after: State) -> State:
+    """Freeze a robot for good, in its last healthy state, if it fell or became non-finite; the frame count goes on."""
+    ok = before.ok & hexapod.is_healthy(after.data)
     return replace(_where(ok, after, before), ok=ok, frame=after.frame)
 
 
-def _where(condition: Bool[Array, ""], chosen: Any, otherwise: Any) -> Any:
+def _where(condition: Bool[Array, ""], chosen: Tree, otherwise: Tree) -> Tree:
     """Choose between two pytrees of one structure."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), chosen, otherwise)

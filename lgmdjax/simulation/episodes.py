@@ -1,49 +1,56 @@
-"""Recorded walks on disk: Parquet, one row a frame, with units, parameters and versions in every file.
+"""Recorded walks on disk: Parquet, one row for each frame, with units, parameters and versions in every file.
+
+A walk is the recorded trajectory of one robot in one room.
 
 | column                        | unit     | what                                                        |
 | ----------------------------- | -------- | ----------------------------------------------------------- |
-| episode, robot, room, seed    | -        | which walk: of a batch, of which robot, in which room       |
+| episode, robot, room, seed    | -        | which walk: index of batch and robot, room and its seed     |
 | time                          | s        | since the start of the walk                                 |
-| x, y, z, qw, qx, qy, qz       | m, 1     | pose of the trunk, from which the pictures were drawn       |
+| x, y, z, qw, qx, qy, qz       | m, 1     | pose of the trunk, from which the pictures were rendered    |
 | joint_0 .. joint_17           | rad      | coxa, femur, tibia of legs 0..5                             |
-| u_*, feed_forward_*           | 1, grey  | what the LGMD of the left and the right eye says            |
-| excitation_*                  | grey     | what u would be told by, were there no gate                 |
-| distance_*                    | m        | nearest thing in the left and the right hemifield           |
-| label_*, velocity_*           | nominal  | what the teacher says, and what the robot was told          |
-| clearance, contact            | m, -     | least clearance within the frame, and whether it was none   |
-| fresh, setbacks, ok           | -        | just put down, how often so far, sound                      |
+| u_*, feed_forward_*           | 1, grey  | outputs of the LGMD of the left and the right eye           |
+| excitation_*                  | grey     | mean excitation of the LGMD, before feed-forward inhibition |
+| distance_*                    | m        | nearest obstacle in the left and the right hemifield        |
+| label_*, velocity_*           | nominal  | velocity of the teacher, and velocity of the policy         |
+| clearance, contact            | m, -     | smallest clearance within the frame, and whether it was <= 0 |
+| is_first, resets, ok          | -        | first frame after a start or reset, resets so far, healthy  |
 
-Pictures are not stored: `lgmdjax.simulation.rerender` draws them again from the poses. A walk is written in chunks,
-each a file that is complete before it gets its name, so that a kill at any moment loses the running chunk at most.
-Numbers keep the precision in which they came.
+Pictures are not stored: `lgmdjax.simulation.rerender` renders them again from the poses. A walk is written in chunks.
+Each chunk is a file that gets its name when it is complete, so that an interruption loses only the present chunk.
+Numbers keep their precision.
 
-Source: Cizek & Faigl, sec. 4.2 and 5.1: the training data are stretches of collision-free walking.
+Version 1 called the columns `is_first` and `resets` "fresh" and "setbacks"; it can still be read.
+
+Source: Cizek & Faigl, sec. 4.2 and 5.1: the training data are segments of collision-free walking.
 """
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
+import jax
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Bool, Float, Int
+from flax import struct
 
 from lgmdjax.errors import InputError
-from lgmdjax.runtime import versions
+from lgmdjax.runtime import storage, versions
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation.closed_loop import Record
 
-FORMAT, VERSION = "lgmdjax episodes", 1
+FORMAT, VERSION = "lgmdjax episodes", 2
+RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, VERSION: {}}
+"""Versions that can be read, and their other names of columns."""
+
 SIDES = ("left", "right")
 
 
 @dataclass(frozen=True)
 class Field:
-    """How one field of a frame becomes columns."""
+    """Names of the columns that hold one field of `Record`, and their unit."""
 
     columns: tuple[str, ...]
     unit: str = ""
@@ -62,80 +69,66 @@ FIELDS: Mapping[str, Field] = {
     "velocity": Field(tuple(f"velocity_{side}" for side in SIDES), "0.05 m/s"),
     "clearance": Field(("clearance",), "m"),
     "contact": Field(("contact",)),
-    "fresh": Field(("fresh",)),
-    "setbacks": Field(("setbacks",)),
+    "is_first": Field(("is_first",)),
+    "resets": Field(("resets",)),
     "ok": Field(("ok",)),
 }
-WALK = ("episode", "robot", "room", "seed")
-COLUMNS = (*WALK, *(column for field in FIELDS.values() for column in field.columns))
+"""The columns of each field of `Record`, in its order."""
+
+ORIGIN = ("episode", "robot", "room", "seed")
+COLUMNS = (*ORIGIN, *(column for field in FIELDS.values() for column in field.columns))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Walk:
-    """Frames of one robot in one room, in order, each array with the frames first."""
+@struct.dataclass(kw_only=True)
+class Walk(Record):
+    """Recorded trajectory of one robot in one room: a `Record` with axis (frame) of NumPy arrays, and its origin."""
 
-    episode: int
-    robot: int
-    room: int
-    seed: int
-    time: Float[np.ndarray, "frames"]
-    position: Float[np.ndarray, "frames 3"]
-    quaternion: Float[np.ndarray, "frames 4"]
-    joints: Float[np.ndarray, "frames 6 3"]
-    u: Float[np.ndarray, "frames 2"]
-    feed_forward: Float[np.ndarray, "frames 2"]
-    excitation: Float[np.ndarray, "frames 2"]
-    distances: Float[np.ndarray, "frames 2"]
-    label: Float[np.ndarray, "frames 2"]
-    velocity: Float[np.ndarray, "frames 2"]
-    clearance: Float[np.ndarray, "frames"]
-    contact: Bool[np.ndarray, "frames"]
-    fresh: Bool[np.ndarray, "frames"]
-    setbacks: Int[np.ndarray, "frames"]
-    ok: Bool[np.ndarray, "frames"]
+    episode: int = struct.field(pytree_node=False)
+    robot: int = struct.field(pytree_node=False)
+    room: int = struct.field(pytree_node=False)
+    seed: int = struct.field(pytree_node=False)
 
     def __len__(self) -> int:
         return len(self.time)
 
     def __getitem__(self, frames: slice) -> "Walk":
-        """Cut out some frames."""
-        cut = {name: getattr(self, name)[frames] for name in FIELDS}
-        return Walk(episode=self.episode, robot=self.robot, room=self.room, seed=self.seed, **cut)
+        """Return a slice of the frames."""
+        return jax.tree.map(lambda leaf: leaf[frames], self)
 
 
 class Writer:
-    """Writes walks into a folder, a file a chunk; carries on after the chunks that are already there.
+    """Writes walks into a folder, one file for each chunk, after the chunks that are already there.
 
     Args:
-        folder: made if it is not there.
-        parameters: JSON values that the walks were made with; chunks of other parameters are refused.
+        folder: created if missing.
+        parameters: JSON values that identify the rollout; chunks of other parameters are refused.
     """
 
-    def __init__(self, folder: Path | str, parameters: Mapping[str, Any]):
+    def __init__(self, folder: Path | str, parameters: JsonObject):
         self.folder = Path(folder)
-        self.parameters = json.loads(json.dumps(dict(parameters)))
+        self.parameters = json.loads(json.dumps(parameters))
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for abandoned in self.folder.glob("*.part"):
-                abandoned.unlink()
+            storage.remove_partial_files(self.folder)
         except OSError as error:
             raise InputError(f"{folder}: expected a folder to write to, got {error}; choose another") from error
         self.chunks = len(_files(self.folder)) and len(_tables(self.folder, self.parameters))
 
-    def write(self, record: Any, *, episode: int, rooms: Sequence[int], seed: int) -> Path:
-        """Write one chunk of a batch of walks: fields of `FIELDS` as arrays with axes (robot, frame, ...).
+    def write(self, record: Record, *, episode: int, rooms: Sequence[int], seed: int) -> Path:
+        """Write one chunk of a batch of walks and return its path.
 
-        `record` is a mapping or an object with those names (`simulation.Record`); `rooms` has a room a robot.
+        Args:
+            record: axes (robot, frame).
+            episode: index of the batch.
+            rooms: index of the room of each robot.
+            seed: seed of the rooms.
         """
         table = _table(record, episode, rooms, seed)
         path = self.folder / f"chunk-{self.chunks:05d}.parquet"
-        partial = path.with_suffix(".part")
+        table = table.replace_schema_metadata(self._metadata())
         try:
-            table = table.replace_schema_metadata(self._metadata())
-            pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
-            with partial.open("rb") as file:
-                os.fsync(file.fileno())
-            partial.replace(path)
+            with storage.replacing(path, sync=True) as partial:
+                pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
         except OSError as error:
             raise InputError(f"{path}: expected to write a chunk, got {error}; free some disk") from error
         self.chunks += 1
@@ -153,12 +146,12 @@ class Writer:
         return {"lgmdjax": json.dumps(header)}
 
 
-def read(folder: Path | str, parameters: Mapping[str, Any] | None = None) -> list[Walk]:
-    """Read all walks of a folder, by episode and robot; raise `InputError` for damaged or mixed files.
+def read(folder: Path | str, parameters: JsonObject | None = None) -> list[Walk]:
+    """Return all walks of a folder, by episode and robot; raise `InputError` for damaged or mixed files.
 
     Args:
-        folder: where a `Writer` wrote.
-        parameters: what the walks must have been made with, if that matters.
+        folder: of a `Writer`.
+        parameters: required parameters of the walks; any if None.
     """
     tables = _tables(Path(folder), parameters)
     if not tables:
@@ -168,55 +161,56 @@ def read(folder: Path | str, parameters: Mapping[str, Any] | None = None) -> lis
     except pa.ArrowException as error:
         raise InputError(f"{folder}: expected chunks of one precision, got mixed ones; collect again") from error
     columns = {name: table[name].to_numpy() for name in COLUMNS}
-    # Stable, so that the frames of a walk stay in the order of the chunks.
+    # The sort is stable: frames of a walk stay in the order of the chunks.
     order = np.lexsort((columns["robot"], columns["episode"]))
     columns = {name: values[order] for name, values in columns.items()}
     changes = (np.diff(columns["episode"]) != 0) | (np.diff(columns["robot"]) != 0)
-    return [_walk(columns, slice(*span)) for span in _spans(changes)]
+    return [_walk(columns, slice(*span)) for span in _runs(changes)]
 
 
-def parameters(folder: Path | str) -> dict[str, Any]:
-    """Read what the walks of a folder were made with; nothing if there are none."""
+def read_parameters(folder: Path | str) -> JsonObject:
+    """Return the parameters of the walks in a folder; empty if there are none."""
     files = _files(Path(folder))
     return _header(files[0])["parameters"] if files else {}
 
 
-def batched(walks: Sequence[Walk]) -> Record:
-    """Put walks of equal length together again as one record with axes (robot, frame)."""
+def stack_walks(walks: Sequence[Walk]) -> Record:
+    """Stack walks of equal length to one record with axes (robot, frame)."""
     return Record(**{name: np.stack([getattr(walk, name) for walk in walks]) for name in FIELDS})
 
 
-def stretches(walks: Sequence[Walk], minimum: int = 90, settle: int = 2) -> list[Walk]:
-    """Cut walks into stretches of sound, collision-free, uninterrupted walking.
+def segments(walks: Sequence[Walk], min_frames: int = 90, settle_frames: int = 2) -> list[Walk]:
+    """Cut walks into segments without contact, reset, fall or missing frames.
 
     Args:
         walks: whole walks.
-        minimum: frames that a stretch must have.
-        settle: frames dropped after the robot was put down: the eyes first need two pictures to compare.
+        min_frames: minimum length of a segment.
+        settle_frames: frames dropped after a start or reset, since the LGMDs first need two pictures to compare.
     """
-    return [stretch for walk in walks for stretch in _stretches(walk, settle) if len(stretch) >= max(minimum, 1)]
+    cut = (segment for walk in walks for segment in _segments(walk, settle_frames))
+    return [segment for segment in cut if len(segment) >= max(min_frames, 1)]
 
 
-def _stretches(walk: Walk, settle: int) -> Iterator[Walk]:
+def _segments(walk: Walk, settle_frames: int) -> Iterator[Walk]:
     good = walk.ok & ~walk.contact
     period = np.median(np.diff(walk.time)) if len(walk) > 1 else 0.0
     gap = np.diff(walk.time) > 1.5 * period
-    changes = (np.diff(good) != 0) | (np.diff(walk.setbacks) != 0) | gap
-    for first, last in _spans(changes):
+    changes = (np.diff(good) != 0) | (np.diff(walk.resets) != 0) | gap
+    for first, end in _runs(changes):
         if good[first]:
-            put_down = first == 0 or walk.fresh[first]
-            yield walk[first + settle * put_down : last]
+            after_reset = first == 0 or walk.is_first[first]
+            yield walk[first + settle_frames * after_reset : end]
 
 
-def _spans(changes: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Yield (first, end) of the runs between changes; `changes[k]` says that k + 1 differs from k."""
+def _runs(changes: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Yield (first, end) of the runs between changes; `changes[k]` is true where item k + 1 differs from item k."""
     bounds = [0, *(np.flatnonzero(changes) + 1).tolist(), len(changes) + 1]
     yield from pairwise(bounds)
 
 
-def _table(record: Any, episode: int, rooms: Sequence[int], seed: int) -> pa.Table:
-    fields = record if isinstance(record, Mapping) else vars(record)
-    robots, frames = np.shape(fields["time"])
+def _table(record: Record, episode: int, rooms: Sequence[int], seed: int) -> pa.Table:
+    """Return the columns of a record; raise `InputError` if its shapes do not fit."""
+    robots, frames = np.shape(record.time)
     if len(rooms) != robots:
         raise InputError(f"episodes: expected a room for each of {robots} robots, got {len(rooms)}")
     columns = {
@@ -226,7 +220,7 @@ def _table(record: Any, episode: int, rooms: Sequence[int], seed: int) -> pa.Tab
         "seed": np.full(robots * frames, seed, np.int64),
     }
     for name, field in FIELDS.items():
-        values = np.asarray(fields[name])
+        values = np.asarray(getattr(record, name))
         if values.size != robots * frames * len(field.columns):
             raise InputError(
                 f"episodes {name}: expected {len(field.columns)} numbers a frame for {robots} robots and "
@@ -238,23 +232,23 @@ def _table(record: Any, episode: int, rooms: Sequence[int], seed: int) -> pa.Tab
 
 
 def _walk(columns: Mapping[str, np.ndarray], frames: slice) -> Walk:
-    walk: dict[str, Any] = {name: int(columns[name][frames][0]) for name in WALK}
-    fields = {name: [columns[column][frames] for column in field.columns] for name, field in FIELDS.items()}
-    arrays: dict[str, Any] = {
-        name: np.stack(cols, axis=1) if len(cols) > 1 else cols[0] for name, cols in fields.items()
-    }
+    episode, robot, room, seed = (int(columns[name][frames][0]) for name in ORIGIN)
+    arrays: dict[str, np.ndarray] = {}
+    for name, field in FIELDS.items():
+        values = [columns[column][frames] for column in field.columns]
+        arrays[name] = np.stack(values, axis=1) if len(values) > 1 else values[0]
     arrays["joints"] = arrays["joints"].reshape(-1, 6, 3)
-    return Walk(**walk, **arrays)
+    return Walk(episode=episode, robot=robot, room=room, seed=seed, **arrays)
 
 
 def _files(folder: Path) -> list[Path]:
     return sorted(folder.glob("chunk-*.parquet"))
 
 
-def _tables(folder: Path, parameters: Mapping[str, Any] | None) -> list[pa.Table]:
-    """Read and check every chunk, in order."""
+def _tables(folder: Path, parameters: JsonObject | None) -> list[pa.Table]:
+    """Return the checked tables of all chunks, in order."""
     tables = []
-    expected = None if parameters is None else json.loads(json.dumps(dict(parameters)))
+    expected = None if parameters is None else json.loads(json.dumps(parameters))
     for number, path in enumerate(_files(folder)):
         if path.name != f"chunk-{number:05d}.parquet":
             raise InputError(f"{folder}: expected chunk-{number:05d}.parquet, got {path.name}; a chunk is missing")
@@ -268,8 +262,8 @@ def _tables(folder: Path, parameters: Mapping[str, Any] | None) -> list[pa.Table
     return tables
 
 
-def _header(path: Path) -> dict[str, Any]:
-    """Read and check what a chunk says about itself."""
+def _header(path: Path) -> JsonObject:
+    """Return the checked header of a chunk."""
     try:
         text = (pq.read_schema(path).metadata or {}).get(b"lgmdjax")
     except (OSError, pa.ArrowException) as error:
@@ -277,18 +271,22 @@ def _header(path: Path) -> dict[str, Any]:
     header = json.loads(text) if text else {}
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: expected recorded walks, got Parquet of another kind; move it elsewhere")
-    if header.get("version") != VERSION:
+    if header.get("version") not in RENAMED:
+        readable = " or ".join(map(str, RENAMED))
         raise InputError(
-            f"{path}: expected walks of version {VERSION}, got {header.get('version')}; collect them again"
+            f"{path}: expected walks of version {readable}, got {header.get('version')}; collect them again"
         )
     return header
 
 
 def _read(path: Path) -> pa.Table:
+    """Return the columns of a chunk under their present names."""
+    renamed = RENAMED[_header(path)["version"]]
     try:
         table = pq.read_table(path, page_checksum_verification=True)
     except (OSError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
+    table = table.rename_columns([renamed.get(name, name) for name in table.column_names])
     if missing := set(COLUMNS) - set(table.column_names):
         raise InputError(f"{path}: expected all columns, got none called {min(missing)}; collect it again")
     return table.select(COLUMNS)
@@ -299,7 +297,7 @@ def _damaged(path: Path, error: Exception) -> InputError:
     return InputError(f"{path}: expected a whole Parquet file, got: {line}; remove it, or collect it again")
 
 
-def _differences(expected: Mapping[str, Any], found: Mapping[str, Any]) -> str:
-    """Name what differs between two sets of parameters, in one line."""
+def _differences(expected: JsonObject, found: JsonObject) -> str:
+    """Return the differences of two sets of parameters as one line."""
     names = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
     return ", ".join(f"{name} {found.get(name)} for {expected.get(name)}" for name in names)

@@ -1,129 +1,196 @@
-"""TODO docstring."""
+"""Rollouts of any number of robots on the host, with a progress bar, returned or recorded in a folder."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
-from mujoco import mjx
 from tqdm import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import policies
-from lgmdjax.simulation import closed_loop, episodes, rollout
-from lgmdjax.simulation.assembly import digest, seat
-from lgmdjax.simulation.room_batches import bench_rooms
+from lgmdjax.control.names import PolicyName
+from lgmdjax.runtime.mjx import mjx
+from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.simulation import closed_loop, episodes
+from lgmdjax.simulation.assembly import fingerprint, select_policy
+from lgmdjax.simulation.rollout import concatenate_time, rollout_chunks
+from lgmdjax.simulation.room_batches import benchmark_rooms
 from lgmdjax.simulation.settings import BenchmarkRooms
 
+BATCH_SIZE = 16  # robots that are rolled out at once
+CHUNK_SECONDS = 5.0  # s of robot time between two updates of the progress bar
+PROGRESS_FORMAT = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"
 
-def walks(
+
+def rollout(
+    robot: closed_loop.Params,
+    rooms: closed_loop.Room,
+    *,
+    seconds: float,
+    policy: PolicyName = "learned",
+    render: bool | None = None,
+) -> closed_loop.Record:
+    """Roll out a robot in each of some rooms, and return a NumPy record with axes (robot, frame).
+
+    The first call compiles the simulation, which takes minutes.
+
+    ```python
+    import jax
+    import lgmdjax as lj
+
+    rooms = lj.random_rooms(jax.random.key(0), 4)
+    record = lj.rollout(lj.load_robot(), rooms, seconds=30)
+    record.position.shape  # (4, 900, 3)
+    ```
+
+    Args:
+        robot: parameters of the robot, as `assembly.load_robot` returns them.
+        rooms: a batch of rooms, as `room_batches.random_rooms` returns it.
+        seconds: of robot time.
+        policy: name of the policy.
+        render: whether to render the cameras; if None, only for policies that use them. Else u is 0.5.
+    """
+    chosen = policies.get_policy(policy)
+    batches = rollout_in_batches(
+        select_policy(robot, chosen),
+        hexapod.build(),
+        rooms,
+        seconds,
+        chosen.name,
+        render=chosen.uses_camera if render is None else render,
+    )
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *(record for _, record in batches))
+
+
+def rollout_with_progress(
     params: closed_loop.Params,
     model: mjx.Model,
     rooms: closed_loop.Room,
     seconds: float,
     label: str,
     *,
-    draw: bool = True,
+    render: bool = True,
 ) -> Iterator[closed_loop.Record]:
-    """Walk a crowd and yield its chunks, with a bar of robot-seconds; the first chunk waits for the compiler."""
+    """Roll out a batch of robots, yielding records of `CHUNK_SECONDS`, with a progress bar in robot-seconds.
+
+    The first chunk waits for the compiler.
+    """
     robots = rooms.starts.shape[0]
     print(f"{label}: compiling the simulation, then {robots} robots for {seconds:g} s each", flush=True)
-    chunks = rollout.chunks(params, model, rooms, policies.ANYONE, seconds, draw=draw, chunk_seconds=CHUNK)
-    # Frames are counted, which are whole: sums of seconds come out beyond the total.
+    chunks = rollout_chunks(params, model, rooms, policies.SWITCH, seconds, render=render, chunk_seconds=CHUNK_SECONDS)
+    # The bar counts frames, which are integers: rounded sums of seconds could exceed the total.
     frames, second = robots * round(seconds * closed_loop.FRAME_RATE), 1 / closed_loop.FRAME_RATE
-    with tqdm(total=frames, desc=label, unit="robot-s", unit_scale=second, bar_format=BAR) as bar:
+    with tqdm(total=frames, desc=label, unit="robot-s", unit_scale=second, bar_format=PROGRESS_FORMAT) as bar:
         for chunk in chunks:
             bar.update(chunk.time.size)
             yield chunk
 
 
-def crowds(
+def rollout_in_batches(
     params: closed_loop.Params,
     model: mjx.Model,
     rooms: closed_loop.Room,
     seconds: float,
     label: str,
     *,
-    draw: bool = True,
-    done: int = 0,
+    render: bool = True,
+    skip_batches: int = 0,
 ) -> Iterator[tuple[list[int], closed_loop.Record]]:
-    """Walk any number of robots, `CROWD` at once, so that one program serves all; yield their numbers and their walks.
+    """Roll out any number of robots in batches of `BATCH_SIZE`, yielding indices of robots and their record.
 
-    The last crowd is filled up with its last robot, which is left out again. `done` crowds are skipped.
+    Batches of one size share one compiled program: the last one is padded with its last robot, which is cut from the
+    record. The first `skip_batches` are left out.
     """
     robots = rooms.starts.shape[0]
-    size = min(CROWD, robots)
-    for first in range(done * size, robots, size):
+    size = min(BATCH_SIZE, robots)
+    for first in range(skip_batches * size, robots, size):
         present = list(range(first, min(first + size, robots)))
-        filled = np.minimum(np.arange(first, first + size, dtype=np.int32), robots - 1)
-        some = jax.tree.map(lambda leaf, filled=filled: leaf[filled], rooms)
+        padded = np.minimum(np.arange(first, first + size, dtype=np.int32), robots - 1)
+        batch = jax.tree.map(lambda leaf, padded=padded: leaf[padded], rooms)
         part = f"{label}, {first + 1} to {present[-1] + 1} of {robots}"
-        record = rollout.together(list(walks(params, model, some, seconds, part, draw=draw)))
+        record = concatenate_time(list(rollout_with_progress(params, model, batch, seconds, part, render=render)))
         yield present, jax.tree.map(lambda leaf, present=present: leaf[: len(present)], record)
 
 
-def walked(
+def record_rollouts(
     folder: Path,
     params: closed_loop.Params,
     rooms: closed_loop.Room,
     seconds: float,
-    driver: policies.Driver,
+    policy: policies.Policy,
     *,
     seed: int,
-    facts: Mapping[str, Any],
+    parameters: JsonObject,
     label: str,
-    draw: bool | None = None,
+    render: bool | None = None,
 ) -> closed_loop.Record:
-    """Walk a driver through rooms and keep the walks in a folder, a file a crowd; after those that are there already.
+    """Roll out a policy and record it in a folder, one file for each batch; return the whole record.
+
+    Batches that the folder already has are not repeated.
 
     Args:
-        facts: JSON values that tell this walk from others; a folder of other walks is refused.
-        seed: that the rooms were drawn with. label: for the progress bar.
-        draw: what the eyes see; for drivers that look if None.
+        folder: where to write.
+        params: the robot.
+        rooms: a batch of rooms, one for each robot.
+        seconds: of robot time.
+        policy: the policy to roll out.
+        seed: the seed of the rooms.
+        parameters: JSON values that identify this rollout; a folder of other rollouts is refused.
+        label: of the progress bar.
+        render: whether to render the cameras; if None, only for policies that use them.
     """
-    writer = episodes.Writer(folder, facts)
-    looks = driver in (policies.LEARNED, policies.DIRECT) if draw is None else draw
-    walks = crowds(
-        seat(params, driver), hexapod.build(), rooms, seconds, f"{label}: {driver.name}", draw=looks, done=writer.chunks
+    writer = episodes.Writer(folder, parameters)
+    batches = rollout_in_batches(
+        select_policy(params, policy),
+        hexapod.build(),
+        rooms,
+        seconds,
+        f"{label}: {policy.name}",
+        render=policy.uses_camera if render is None else render,
+        skip_batches=writer.chunks,
     )
-    for numbers, record in walks:
-        writer.write(record, episode=writer.chunks, rooms=numbers, seed=seed)
-    return episodes.batched(episodes.read(folder))
+    for indices, record in batches:
+        writer.write(record, episode=writer.chunks, rooms=indices, seed=seed)
+    return episodes.stack_walks(episodes.read(folder))
 
 
-def has_walked(folder: Path, robots: int) -> bool:
-    """Tell whether all crowds of so many robots are in a folder of `walked`."""
-    return len(list(folder.glob("chunk-*.parquet"))) * min(CROWD, robots) >= robots
+def is_recorded(folder: Path, robots: int) -> bool:
+    """Return whether a folder of `record_rollouts` has all batches of this number of robots."""
+    return len(list(folder.glob("chunk-*.parquet"))) * min(BATCH_SIZE, robots) >= robots
 
 
-def benched(
+def record_benchmark(
     folder: Path,
     params: closed_loop.Params,
-    bench: BenchmarkRooms,
-    driver: policies.Driver,
+    benchmark: BenchmarkRooms,
+    policy: policies.Policy,
     seed: int,
     *,
     label: str,
-    draw: bool | None = None,
+    render: bool | None = None,
     contrast: float = 1.0,
 ) -> closed_loop.Record:
-    """Walk a driver through the rooms in which robots of a study are compared, the same for the same seed.
+    """Record a policy in the benchmark rooms of a study, which are the same for the same seed.
 
     Args:
-        folder: as in `walked`, and so are `label` and `draw`. bench: how many rooms, and how long.
-        contrast: of all textures, by which theirs is multiplied.
+        folder: where to write.
+        params: the robot.
+        benchmark: how many rooms, and for how long.
+        policy: the policy to roll out.
+        seed: the seed of the rooms.
+        label: of the progress bar.
+        render: whether to render the cameras; if None, only for policies that use them.
+        contrast: factor for the contrast of all textures.
     """
-    rooms = bench_rooms(bench, seed, contrast)
-    facts = {"bench": asdict(bench), "driver": driver.name, "contrast": contrast, "robot": digest(params)}
-    return walked(folder, params, rooms, bench.seconds, driver, seed=seed, facts=facts, label=label, draw=draw)
-
-
-CROWD = 16
-
-
-CHUNK = 5.0  # s of robot time between two signs of life
-
-
-BAR = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"
+    rooms = benchmark_rooms(benchmark, seed, contrast)
+    parameters = {
+        "benchmark": asdict(benchmark),
+        "policy": policy.name,
+        "contrast": contrast,
+        "robot": fingerprint(params),
+    }
+    return record_rollouts(
+        folder, params, rooms, benchmark.seconds, policy, seed=seed, parameters=parameters, label=label, render=render
+    )

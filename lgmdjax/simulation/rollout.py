@@ -1,119 +1,127 @@
-"""Many frames, many robots: the one place that scans and maps.
+"""Rollouts: many frames, many robots. The only place that scans and maps the closed loop.
 
-`walk` scans `simulation.step` over frames for one robot, `advance` scans and maps it for a batch of rooms, and `chunks`
-does that for a few seconds of robot time at once, so that a host can show progress, write what came, and be
-interrupted between two. `march` scans and maps any step of one robot, for those who look at recorded walks again.
+| function         | what it runs                                                                              |
+| ---------------- | ----------------------------------------------------------------------------------------- |
+| `rollout`        | `closed_loop.step` scanned over frames, for one robot                                     |
+| `rollout_batch`  | the same for a batch of robots, sharded over devices (`lgmdjax.simulation.sharding`)      |
+| `rollout_chunks` | that in chunks of a few seconds, so that the host can show progress, write, or stop       |
+| `scan_batch`     | any step of one robot, scanned and mapped, such as one that looks at recorded walks again |
 
-The robots of a batch are dealt out to the devices (`deal`). A core of a CPU is one if `JAX_NUM_CPU_DEVICES` says so
-before JAX starts, as the command line does: a body is many small sums in a row, which cores cannot share, but robots
-are apart.
+On the command line and in notebooks use `lgmdjax.simulation.recording.rollout`.
 """
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
-from mujoco import mjx
 
-from lgmdjax.control.policies import Driver
+from lgmdjax.control.policies import Policy
+from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import closed_loop
 from lgmdjax.simulation.closed_loop import Params, Record, Room, State
-from lgmdjax.simulation.sharding import deal
+from lgmdjax.simulation.sharding import shard_robots
+
+RoomT = TypeVar("RoomT")
+StateT = TypeVar("StateT")
+InputT = TypeVar("InputT")
+OutputT = TypeVar("OutputT")
 
 
-def walk(
+def rollout(
     params: Params,
     model: mjx.Model,
     room: Room,
     state: State,
-    driver: Driver,
+    policy: Policy,
+    *,
     frames: int,
-    draw: Bool[Array, ""] | bool = True,
+    render: Bool[Array, ""] | bool = True,
 ) -> tuple[State, Record]:
-    """Walk one robot for a static number of frames; the record has a leading axis of frames."""
+    """Roll out one robot for a static number of frames; the record has a leading axis of frames."""
 
     def frame(state: State, _: None) -> tuple[State, Record]:
-        return closed_loop.step(params, model, room, state, driver, draw)
+        return closed_loop.step(params, model, room, state, policy, render=render)
 
     return jax.lax.scan(frame, state, length=frames)
 
 
-@partial(jax.jit, static_argnames="driver")
-def start(params: Params, model: mjx.Model, rooms: Room, *, driver: Driver) -> State:
-    """Put one robot into each room of a batch."""
-    return deal(jax.vmap(lambda room: closed_loop.init(params, model, room, driver)), rooms)
+@partial(jax.jit, static_argnames="policy")
+def reset_batch(params: Params, model: mjx.Model, rooms: Room, *, policy: Policy) -> State:
+    """Return the initial states of a batch of robots, one in each room."""
+    return shard_robots(jax.vmap(lambda room: closed_loop.init(params, model, room, policy)), rooms)
 
 
-@partial(jax.jit, static_argnames=("driver", "frames"), donate_argnames="states")
-def advance(
+@partial(jax.jit, static_argnames=("policy", "frames"), donate_argnames="states")
+def rollout_batch(
     params: Params,
     model: mjx.Model,
     rooms: Room,
     states: State,
     *,
-    driver: Driver,
+    policy: Policy,
     frames: int,
-    draw: Bool[Array, ""] | bool,
+    render: Bool[Array, ""] | bool,
 ) -> tuple[State, Record]:
-    """Walk a batch of robots, each in its own room; the record's axes are (robot, frame)."""
+    """Roll out a batch of robots, each in its own room; the record's axes are (robot, frame)."""
 
     def step(room: Room, state: State, _: None) -> tuple[State, Record]:
-        return closed_loop.step(params, model, room, state, driver, draw)
+        return closed_loop.step(params, model, room, state, policy, render=render)
 
-    return deal(lambda rooms, states: march(step, rooms, states, length=frames), rooms, states)
+    return shard_robots(lambda rooms, states: scan_batch(step, rooms, states, length=frames), rooms, states)
 
 
-def march(
-    step: Callable[[Any, Any, Any], tuple[Any, Any]],
-    rooms: Any,
-    states: Any,
-    series: Any = None,
+def scan_batch(
+    step: Callable[[RoomT, StateT, InputT], tuple[StateT, OutputT]],
+    rooms: RoomT,
+    states: StateT,
+    inputs: InputT = None,
     *,
     length: int | None = None,
-) -> tuple[Any, Any]:
-    """Scan `step(room, state, row)` of one robot over frames, mapped over robots; gives the last states and what came.
+) -> tuple[StateT, OutputT]:
+    """Scan `step(room, state, input)` of one robot over frames, mapped over robots; return last states and outputs.
 
-    `series` and what comes out have axes (robot, frame). A `vmap` of a `lax.scan` gives the same, but JAX traces the
-    body of the loop some more times then, to find out what differs between robots: for a walk a third longer in all.
+    Inputs and outputs have axes (robot, frame). A `vmap` of a `lax.scan` gives the same results, but then JAX traces
+    the loop body several more times to find out what differs between robots; tracing a rollout takes a third longer.
     """
 
-    def frame(states: Any, rows: Any) -> tuple[Any, Any]:
-        return jax.vmap(step)(rooms, states, rows)
+    def frame(states: StateT, inputs: InputT) -> tuple[StateT, OutputT]:
+        return jax.vmap(step)(rooms, states, inputs)
 
-    states, out = jax.lax.scan(frame, states, _swapped(series), length=length)
-    return states, _swapped(out)
+    states, outputs = jax.lax.scan(frame, states, _swap_axes(inputs), length=length)
+    return states, _swap_axes(outputs)
 
 
-def _swapped(series: Any) -> Any:
+def _swap_axes(series: OutputT) -> OutputT:
+    """Exchange the axes of robots and frames."""
     return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), series)
 
 
-def chunks(
+def rollout_chunks(
     params: Params,
     model: mjx.Model,
     rooms: Room,
-    driver: Driver,
+    policy: Policy,
     seconds: float,
     *,
-    draw: bool = True,
+    render: bool = True,
     chunk_seconds: float = 5.0,
 ) -> Iterator[Record]:
-    """Walk a batch of robots for `seconds`, yielding host records of `chunk_seconds` as they come.
+    """Roll out a batch of robots for `seconds`, yielding NumPy records of `chunk_seconds` one after the other.
 
-    One program is compiled for all chunks: the last one may walk on past the end, and is cut.
+    One program is compiled for all chunks; the last one may run past the end and is cut.
     """
     frames = max(1, round(chunk_seconds * closed_loop.FRAME_RATE))
     total = round(seconds * closed_loop.FRAME_RATE)
-    states = start(params, model, rooms, driver=driver)
+    states = reset_batch(params, model, rooms, policy=policy)
     for done in range(0, total, frames):
-        states, record = advance(params, model, rooms, states, driver=driver, frames=frames, draw=draw)
+        states, record = rollout_batch(params, model, rooms, states, policy=policy, frames=frames, render=render)
         yield jax.tree.map(lambda leaf, left=total - done: np.asarray(leaf)[:, :left], record)
 
 
-def together(records: list[Record]) -> Record:
-    """Join the chunks of one walk along their frames."""
+def concatenate_time(records: list[Record]) -> Record:
+    """Concatenate the chunks of one rollout along the axis of frames."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *records)

@@ -1,4 +1,12 @@
-"""TODO docstring."""
+"""Batches of rooms: one `closed_loop.Room` whose leaves have a leading axis of robots.
+
+| function          | rooms                                                                     |
+| ----------------- | ------------------------------------------------------------------------- |
+| `random_rooms`    | random obstacles, sampled from a key                                      |
+| `replicate_room`  | one arena for all robots, with different starts                           |
+| `training_rooms`  | random rooms of one training episode, of various contrasts                |
+| `benchmark_rooms` | held-out random rooms in which studies compare robots                     |
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -7,69 +15,73 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lgmdjax.simulation import closed_loop
 from lgmdjax.simulation.closed_loop import Room
 from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.world import scenes
-from lgmdjax.world.arena import Arena, free_poses
+from lgmdjax.world.arena import Arena, sample_free_poses
 
-STARTS = 32  # places where a room's robot is put down, one after the other
+START_COUNT = 32  # starts of a room's robot, one for each reset, used in order
+BENCHMARK_EPISODE = 2**23  # episode number of `benchmark_rooms`; training episodes never get so far
+CONTRAST_RANGE = (0.3, 1.0)  # factors by which the contrast of training rooms is scaled
 
 
 @partial(jax.jit, static_argnames="count")
 def random_rooms(key: Array, count: int, density: Float[Array, ""] | float = 0.15) -> Room:
-    """Draw rooms that a key alone decides, each with its starts; the same key and index give the same room."""
+    """Return random rooms with random starts; the same key and index give the same room.
+
+    >>> random_rooms(jax.random.key(0), 4).starts.shape
+    (4, 32, 3)
+
+    Args:
+        key: random key of the whole batch.
+        count: number of rooms, one for each robot.
+        density: of obstacles, as in `scenes.random_room`.
+    """
 
     def room(key: Array) -> Room:
-        arena_key, starts_key, luck = jax.random.split(key, 3)
+        arena_key, starts_key, policy_key = jax.random.split(key, 3)
         arena = scenes.random_room(arena_key, density)
-        return Room(arena=arena, starts=free_poses(starts_key, arena, STARTS), key=luck)
+        return Room(arena=arena, starts=sample_free_poses(starts_key, arena, START_COUNT), key=policy_key)
 
     return jax.vmap(lambda index: room(jax.random.fold_in(key, index)))(jnp.arange(count))
 
 
 @partial(jax.jit, static_argnames="count")
-def copies(key: Array, arena: Arena, count: int, spread: Float[Array, ""] | float = jnp.pi) -> Room:
-    """Give every robot of a crowd the same room: first its own start, turned by up to `spread`, then free ones."""
+def replicate_room(key: Array, arena: Arena, count: int, spread: Float[Array, ""] | float = jnp.pi) -> Room:
+    """Return a batch of rooms with the same arena: its own start, turned by up to `spread` [rad], then free starts."""
 
     def room(key: Array) -> Room:
-        turn_key, starts_key, luck = jax.random.split(key, 3)
+        turn_key, starts_key, policy_key = jax.random.split(key, 3)
         turn = jnp.asarray([0, 0, 1]) * jax.random.uniform(turn_key, minval=-spread, maxval=spread)
-        later = free_poses(starts_key, arena, STARTS - 1)
-        return Room(arena=arena, starts=jnp.concatenate([(arena.start + turn)[None], later]), key=luck)
+        later = sample_free_poses(starts_key, arena, START_COUNT - 1)
+        return Room(arena=arena, starts=jnp.concatenate([(arena.start + turn)[None], later]), key=policy_key)
 
     return jax.vmap(lambda index: room(jax.random.fold_in(key, index)))(jnp.arange(count))
 
 
-def stack(rooms: list[Room]) -> Room:
-    """Batch rooms of one padding, so that every robot has its own."""
+def stack_rooms(rooms: list[Room]) -> Room:
+    """Stack single rooms with equally many prisms to a batch."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
 
 
-def join(first: Room, second: Room) -> Room:
-    """Put two batches of rooms together."""
+def concatenate_rooms(first: Room, second: Room) -> Room:
+    """Concatenate two batches of rooms."""
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
-def rooms_of(seed: int, episode: int, robots: int) -> closed_loop.Room:
-    """Draw the rooms of an episode to learn in, the same for the same seed and number, of every contrast.
+def training_rooms(seed: int, episode: int, robots: int) -> Room:
+    """Return the random rooms of a training episode, with contrasts in `CONTRAST_RANGE`.
 
-    A robot that has learned in busy rooms only hardly turns from the one thing that moves before a plain wall. Where
-    little moves, little is much; it has to be met to be learned.
+    Rooms of low contrast are needed: a navigator trained only in rooms of high contrast hardly turns from the one
+    moving edge in front of a plain wall, since little motion then means little danger.
     """
     key = jax.random.fold_in(jax.random.key(seed), episode)
     rooms = random_rooms(key, robots)
-    contrast = jax.random.uniform(jax.random.fold_in(key, robots), (robots,), jnp.float32, *CONTRAST)
-    return replace(rooms, arena=jax.vmap(scenes.faded)(rooms.arena, contrast))
+    contrast = jax.random.uniform(jax.random.fold_in(key, robots), (robots,), jnp.float32, *CONTRAST_RANGE)
+    return replace(rooms, arena=jax.vmap(scenes.scale_contrast)(rooms.arena, contrast))
 
 
-def bench_rooms(bench: BenchmarkRooms, seed: int, contrast: float = 1.0) -> closed_loop.Room:
-    """Draw the rooms of `benched`."""
-    rooms = random_rooms(jax.random.fold_in(jax.random.key(seed), BENCH), bench.robots)
-    return replace(rooms, arena=jax.vmap(scenes.faded, in_axes=(0, None))(rooms.arena, contrast))
-
-
-BENCH = 2**23  # number of an episode far from any other: its rooms are met nowhere else
-
-
-CONTRAST = (0.3, 1.0)  # of a room to learn in, times what it is drawn with
+def benchmark_rooms(benchmark: BenchmarkRooms, seed: int, contrast: float = 1.0) -> Room:
+    """Return the held-out random rooms of a benchmark, the contrast of all textures scaled by `contrast`."""
+    rooms = random_rooms(jax.random.fold_in(jax.random.key(seed), BENCHMARK_EPISODE), benchmark.robots)
+    return replace(rooms, arena=jax.vmap(scenes.scale_contrast, in_axes=(0, None))(rooms.arena, contrast))

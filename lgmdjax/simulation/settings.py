@@ -7,8 +7,8 @@ from lgmdjax.sensors.settings import CameraSettings
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkRooms:
-    """The rooms in which a study compares robots: as many, for as long."""
+    """Rooms in which a study compares robots: how many, for how long, and with which camera."""
 
     eyes: CameraSettings
     robots: int
-    seconds: float
+    seconds: float  # of robot time in each room

@@ -1,39 +1,41 @@
-"""Does the gradient through the closed loop teach what imitation of recorded walks cannot? Collisions by pupil.
+"""Does finetuning in the closed loop reduce collisions more than DAgger does? Collisions per learner.
 
-Imitation of recorded walks leaves a navigator that does not know what its own commands lead to. DAgger
-(`lgmdjax.learning.dagger`) lets it walk, labels the walks and fits it again; here its imitation loss is differentiated
-through the walk itself (`lgmdjax.learning.finetuning`). From one navigator, fitted to a lesson of the teacher's, come
+Behaviour cloning on recorded walks leaves a navigator that does not know the effects of its own commands. DAgger
+(`lgmdjax.learning.dagger`) records the navigator's own walks, labels them and fits it again. Finetuning differentiates
+the imitation loss through the walk itself (`lgmdjax.learning.finetuning`). All learners begin with one navigator,
+fitted to demonstrations of the teacher:
 
-| pupil                | practice                                                                               |
-| -------------------- | -------------------------------------------------------------------------------------- |
-| imitation            | none                                                                                   |
-| imitation, smooth    | none; its detectors have the smooth steps that it is tuned with: the control for those |
-| dagger               | rounds of DAgger                                                                       |
-| controller           | tuned, the derivative through nothing but the navigator                                |
-| everything           | tuned, through everything                                                              |
-| joint                | so, and shaping networks, T_s, T_f and W_I with it                                     |
-| dagger + everything  | half of the rounds, then tuned for half as long                                        |
-| everything, n frames | tuned through windows of n frames: the horizon                                         |
+| learner              | training                                                                                  |
+| -------------------- | ----------------------------------------------------------------------------------------- |
+| imitation            | none beyond the demonstrations                                                            |
+| imitation, smooth    | none; its detectors have the smooth thresholds of finetuning: the control for those        |
+| dagger               | rounds of DAgger                                                                          |
+| controller           | finetuned, the gradient taken through the navigator only                                  |
+| everything           | finetuned, the gradient taken through everything                                          |
+| joint                | like everything, and shaping networks, T_s, T_f and W_I are trained too                   |
+| dagger + everything  | half of the DAgger rounds, then finetuned for half as long                                |
+| everything, n frames | finetuned through windows of n frames: the horizon                                        |
 
-All practise for the same simulated time, tuned ones in as many rooms as there are rounds, with a rate that lets them
-move as far in a second whatever their windows. DAgger fits again and again to all walks so far; a tune sees every
-window once. While tuning, steps are smooth and contacts those of the XML; then all walk with hard steps, in rooms that
-none of them knows.
+All train for the same simulated time. Finetuned learners walk in as many rooms as there are rounds, with a learning
+rate proportional to their window, so that all can move equally far in a second. DAgger fits to all walks so far again
+and again; finetuning sees every window once. Finetuning uses smooth thresholds and the contacts of the XML. All
+learners are then evaluated with hard thresholds, in held-out rooms.
 
-Nobody's turns are scaled in the end (`training.enliven`): what is compared is what the imitation loss teaches. The
-scale is measured on recorded walks, where a tuned navigator never went, and with it collisions are too rare to tell
-pupils apart. Only while DAgger practises does its navigator walk with it, as it always does.
+The turns are not rescaled (`behaviour_cloning.rescale_turns`), because the study compares what the imitation loss
+teaches. The turn gain is measured on recorded walks, which differ from those of a finetuned navigator, and with it
+collisions are too rare to compare learners. Only during the rounds of DAgger does the navigator walk with it.
 
-| told         | meaning                                                                                           |
-| ------------ | ------------------------------------------------------------------------------------------------- |
-| per_100_m    | collisions, with the exact interval                                                               |
-| near         | approaches, nearer than `apprentice.TIGHT`, per 100 m: more frequent than collisions                |
-| imitation    | mean of |v - v*|^2 over the walk, nominal^2                                                        |
-| curve        | a number a window (`tuning.Row`), over the simulated time of all robots together [s]              |
+| metric               | meaning                                                                                   |
+| -------------------- | ----------------------------------------------------------------------------------------- |
+| per_100_m            | collisions, with the exact interval                                                       |
+| approaches_per_100_m | approaches closer than `dagger.APPROACH_CLEARANCE`: more frequent than collisions          |
+| imitation            | mean of |v - v*|^2 over the walk, nominal^2                                                |
+| curve                | `finetuning.WindowStats` of each window, against the simulated time of all robots [s]      |
 
-If signal / noise is about 1, the mean gradient is what chance makes of the robots' differences.
+A signal / noise of about 1 means that the robots' mean gradient is indistinguishable from sampling noise.
 
-Writes closed_loop.json, a row a pupil and start. A tune carries on from the last room that it was done with.
+Writes closed_loop_finetune.json, a row for each learner and seed. An interrupted finetuning resumes after its last
+finished room.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,7 +43,7 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -58,26 +60,31 @@ from lgmdjax.learning.checkpoints import Checkpoints
 from lgmdjax.locomotion import cpg
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, recording, room_batches
-from lgmdjax.simulation.closed_loop import FRAME_RATE, Params, Record, Room, Through
+from lgmdjax.simulation.closed_loop import FRAME_RATE, GradPath, Params, Record, Room
 from lgmdjax.studies.settings import FinetuneSettings
 
-ROOMS = 2**21  # number of the first episode that robots are tuned in: rooms of their own
-JOINT = ("driver", "shaping", "lgmd.threshold", "lgmd.suppression", "lgmd.inhibition")
-BINS = 12  # of a curve that is drawn
+FIRST_EPISODE = 2**21  # number of the first episode of finetuning, whose rooms are used nowhere else
+JOINT_PARTS = ("policy", "shaping", "lgmd.threshold", "lgmd.suppression", "lgmd.inhibition")
+BINS = 12  # of a plotted curve
 
 
-class Way(NamedTuple):
-    """How a pupil is tuned."""
+class FinetuneMode(NamedTuple):
+    """What the gradient passes through, and which parameters are trained."""
 
-    through: Through = "everything"
-    parts: tuple[str, ...] = ("driver",)
+    grad_path: GradPath = "everything"
+    trainable: tuple[str, ...] = ("policy",)
 
 
-WAYS = {"controller": Way(through="controller"), "everything": Way(), "joint": Way(parts=JOINT)}
+MODES = {
+    "controller": FinetuneMode(grad_path="controller"),
+    "everything": FinetuneMode(),
+    "joint": FinetuneMode(trainable=JOINT_PARTS),
+}
 COLOURS = {
-    "imitation": style.INK,
-    "imitation, smooth": style.QUIET,
+    "imitation": style.DARK,
+    "imitation, smooth": style.GREY,
     "dagger": style.PALETTE[2],
     "controller": style.PALETTE[4],
     "everything": style.PALETTE[0],
@@ -86,159 +93,193 @@ COLOURS = {
 }
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: FinetuneSettings, seed: int) -> None:
-    """Teach all pupils from every start, and score them on one bench."""
-    robot = assembly.with_eyes(assembly.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+def run(folder: Path, inputs: Mapping[str, Path], settings: FinetuneSettings, seed: int) -> None:
+    """Train all learners with every random seed, and score them in the benchmark rooms."""
+    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     rows = []
-    for start in range(settings.seeds):
-        place = folder / f"start-{start}"
-        horizons = () if start else settings.horizons
-        for name, pupil, facts in pupils(place, robot, settings, seed + start, horizons):
-            bench = place / "bench" / name.replace(" ", "-")
-            record = recording.benched(
-                bench, pupil, settings.bench, policies.LEARNED, seed, label=f"{name}, start {start}"
-            )
-            rows.append({"pupil": name, "start": start} | facts | detector(pupil) | told(record))
+    for repeat in range(settings.seeds):
+        repeat_folder = folder / f"repeat-{repeat}"
+        horizons = () if repeat else settings.horizons
+        for name, learner, facts in train_learners(repeat_folder, robot, settings, seed + repeat, horizons):
+            walks, label = repeat_folder / "benchmark" / name.replace(" ", "-"), f"{name}, seed {repeat}"
+            record = recording.record_benchmark(
+                walks, learner, settings.benchmark, policies.LEARNED, seed, label=label
+            )  # fmt: skip
+            rows.append({"learner": name, "repeat": repeat} | facts | detector_constants(learner) | summarise(record))
     storage.write_json(folder / "closed_loop_finetune.json", rows)
 
 
-def pupils(
+def train_learners(
     folder: Path, robot: Params, settings: FinetuneSettings, seed: int, horizons: Sequence[int] = ()
-) -> Iterator[tuple[str, Params, dict[str, Any]]]:
-    """Yield the pupils of a start, one by one: name, robot, and how it was tuned, if it was."""
-    school = settings.practice
-    facts = {"school": asdict(school), "seconds": settings.lesson_seconds}
-    walks = dagger.lesson(folder / "lesson", robot, school.robots, settings.lesson_seconds, seed, facts)
+) -> Iterator[tuple[str, Params, JsonObject]]:
+    """Yield the learners of one seed: name, robot, and the facts and curve of its finetuning, empty without."""
+    training, rounds = settings.dagger, settings.dagger.dagger_rounds
+    facts = {"training": asdict(training), "seconds": settings.demonstration_seconds}
+    walks = dagger.record_demonstrations(
+        folder / "demonstrations", robot, robots=training.robots, seconds=settings.demonstration_seconds, seed=seed,
+        parameters=facts,
+    )  # fmt: skip
 
-    def practised(rounds: int) -> Params:
-        practice = replace(school, rounds=rounds)
-        own = dagger.practise(folder / "dagger", robot, walks, practice, seed)
-        place = folder / "checkpoints" / f"rounds-{rounds}"
-        return assembly.manned(robot, dagger.learn(place, own, school.epochs, seed)[0])
+    def after_dagger(rounds: int) -> Params:
+        own = dagger.run(folder / "dagger", robot, walks, replace(training, dagger_rounds=rounds), seed)
+        checkpoints = folder / "checkpoints" / f"rounds-{rounds}"
+        return assembly.with_policy(robot, "learned", dagger.fit_navigator(checkpoints, own, training.epochs, seed)[0])
 
-    first = practised(0)
+    finetuned = partial(finetune_learner, settings=settings, seed=seed)
+    first, half = after_dagger(0), rounds // 2
     yield "imitation", first, {}
-    yield "imitation, smooth", rollout_gradient.smooth(first), {}
-    yield "dagger", practised(school.rounds), {}
-    for name, way in WAYS.items():
-        yield name, *tuned(folder / name, first, settings, seed, way, settings.window, school.rounds)
-    half = school.rounds // 2
-    name = "dagger + everything"
-    yield name, *tuned(folder / "half", practised(half), settings, seed, Way(), settings.window, school.rounds - half)
+    yield "imitation, smooth", rollout_gradient.smooth_thresholds(first), {}
+    yield "dagger", after_dagger(rounds), {}
+    for name, mode in MODES.items():
+        yield name, *finetuned(folder / name, first, mode=mode, frames=settings.window, rooms=rounds)
+    name, mode = "dagger + everything", FinetuneMode()
+    yield name, *finetuned(folder / "half", after_dagger(half), mode=mode, frames=settings.window, rooms=rounds - half)
     for frames in horizons:
-        place, name = folder / f"window-{frames}", f"everything, {frames} frames"
-        yield name, *tuned(place, first, settings, seed, Way(), frames, school.rounds)
+        name = f"everything, {frames} frames"
+        yield name, *finetuned(folder / f"window-{frames}", first, mode=mode, frames=frames, rooms=rounds)
 
 
-def tuned(
-    folder: Path, pupil: Params, settings: FinetuneSettings, seed: int, way: Way, frames: int, rooms: int
-) -> tuple[Params, dict[str, Any]]:
-    """Tune a pupil while it walks; give the robot as it walks afterwards, its steps hard, and how it was tuned."""
-    school, robot = settings.practice, rollout_gradient.smooth(rollout_gradient.alone(pupil))
-    window = rollout_gradient.Settings(frames=frames, through=way.through, clip=settings.clip)
-    how = finetuning.Settings(
+def finetune_learner(
+    folder: Path, learner: Params, *, settings: FinetuneSettings, mode: FinetuneMode, frames: int, rooms: int, seed: int
+) -> tuple[Params, JsonObject]:
+    """Finetune a learner while it walks; return the robot with hard thresholds, and the facts and curve of its fit.
+
+    Args:
+        folder: for checkpoints.
+        learner: robot to start from.
+        settings: of the study.
+        mode: what the gradient passes through, and what is trained.
+        frames: of the window through which the gradient is taken.
+        rooms: number of rooms that each robot walks in, one after the other.
+        seed: of the rooms.
+    """
+    training, robot = settings.dagger, rollout_gradient.smooth_thresholds(rollout_gradient.learned_only(learner))
+    window = rollout_gradient.Settings(frames=frames, grad_path=mode.grad_path, clip=settings.clip)
+    finetune_settings = finetuning.Settings(
         learning_rate=settings.learning_rate * frames / FRAME_RATE,
-        windows=round(school.round_seconds * FRAME_RATE / frames),
+        windows_per_room=round(training.round_seconds * FRAME_RATE / frames),
         rooms=rooms,
-        parts=way.parts,
+        trainable=mode.trainable,
     )
-    belongs = {"window": asdict(window), "tuning": asdict(how), "robot": assembly.digest(robot), "seed": seed}
-    print(f"{folder.name}: compiling the gradient of {frames} frames through {way.through}", flush=True)
-    with closing(Checkpoints(folder, belongs)) as saved, tqdm(desc=folder.name, unit="window") as bar:
+    identity = {"window": asdict(window), "finetuning": asdict(finetune_settings)}
+    identity |= {"robot": assembly.fingerprint(robot), "seed": seed}
+    print(f"{folder.name}: compiling the gradient of {frames} frames through {mode.grad_path}", flush=True)
+    with closing(Checkpoints(folder, identity)) as checkpoints, tqdm(desc=folder.name, unit="window") as bar:
 
-        def tell(row: finetuning.Row) -> None:
-            bar.set_postfix(loss=f"{row.loss:.3f}")
+        def on_window(stats: finetuning.WindowStats) -> None:
+            bar.set_postfix(loss=f"{stats.loss:.3f}")
             bar.update()
 
-        there = partial(_rooms, seed, school.robots)
-        after, rows = finetuning.tune(robot, hexapod.build(), there, window, how, saved=saved, tell=tell)
-    curve = {name: list(column) for name, column in zip(finetuning.Row._fields, zip(*rows, strict=True), strict=True)}
-    curve["seconds"] = [school.robots * frames / FRAME_RATE * (number + 1) for number in range(len(rows))]
-    return aboard(pupil, after.controller), {"through": way.through, "frames": frames, "curve": curve}
+        after, stats = finetuning.finetune(
+            robot, hexapod.build(), partial(_rooms, seed, training.robots), window, finetune_settings,
+            checkpoints=checkpoints, on_window=on_window,
+        )  # fmt: skip
+    columns = zip(finetuning.WindowStats._fields, zip(*stats, strict=True), strict=True)
+    curve = {name: list(column) for name, column in columns}
+    curve["seconds"] = [training.robots * frames / FRAME_RATE * (number + 1) for number in range(len(stats))]
+    facts = {"grad_path": mode.grad_path, "frames": frames, "curve": curve}
+    return with_finetuned_params(learner, after.controller), facts
 
 
 def _rooms(seed: int, robots: int, number: int) -> Room:
-    return room_batches.rooms_of(seed, ROOMS + number, robots)
+    return room_batches.training_rooms(seed, FIRST_EPISODE + number, robots)
 
 
-def aboard(robot: Params, nerves: controller.Params) -> Params:
-    """Put what was tuned into a robot that all five drivers are aboard of, whose steps stay what they are."""
-    constants = {name: getattr(nerves.lgmd, name) for name in ("threshold", "suppression", "inhibition", "kernel")}
+def with_finetuned_params(robot: Params, finetuned: controller.Params) -> Params:
+    """Return a robot with all five policies and the finetuned parameters; its thresholds stay hard or smooth."""
+    constants = {name: getattr(finetuned.lgmd, name) for name in ("threshold", "suppression", "inhibition", "kernel")}
     detector = replace(robot.controller.lgmd, **constants)
-    own = replace(robot.controller, lgmd=detector, cpg=nerves.cpg, shaping=nerves.shaping)
-    return assembly.manned(replace(robot, controller=own), nerves.driver)
+    own = replace(robot.controller, lgmd=detector, cpg=finetuned.cpg, shaping=finetuned.shaping)
+    return assembly.with_policy(replace(robot, controller=own), "learned", finetuned.policy)
 
 
-def detector(pupil: Params) -> dict[str, float]:
-    """Tell the constants that a joint fit moves."""
-    return {name: float(getattr(pupil.controller.lgmd, name)) for name in ("threshold", "suppression", "inhibition")}
+def detector_constants(learner: Params) -> dict[str, float]:
+    """Return the detector's constants that a joint fit trains."""
+    return {name: float(getattr(learner.controller.lgmd, name)) for name in ("threshold", "suppression", "inhibition")}
 
 
-def told(record: Record) -> dict[str, Any]:
-    """Tell what is compared of a pupil's walks."""
-    score, near = metrics.score(record, cpg.CYCLE_TIME), dagger.approaches(record)
+def summarise(record: Record) -> JsonObject:
+    """Return the score of a learner's walks, its approaches, and its imitation loss."""
+    score, approaches = metrics.score(record, cpg.CYCLE_TIME), dagger.count_approaches(record)
     error = np.mean((np.asarray(record.velocity) - np.asarray(record.label)) ** 2, axis=-1)
-    rate = asdict(metrics.poisson_rate(near, score.distance / 100))
-    return asdict(score) | {"approaches": near, "near": rate, "imitation": float(error[np.asarray(record.ok)].mean())}
-
-
-def pooled(rows: Sequence[Mapping[str, Any]], count: str) -> dict[str, metrics.Estimate]:
-    """Count something per 100 m, the starts of each pupil together, in the order of the rows."""
-    names = dict.fromkeys(row["pupil"] for row in rows)
-    sums = {
-        name: [sum(row[what] for row in rows if row["pupil"] == name) for what in (count, "distance")] for name in names
+    return asdict(score) | {
+        "approaches": approaches,
+        "approaches_per_100_m": asdict(metrics.poisson_rate(approaches, score.distance / 100)),
+        "imitation": float(error[np.asarray(record.ok)].mean()),
     }
-    return {name: metrics.poisson_rate(times, way / 100) for name, (times, way) in sums.items()}
 
 
-def trust(row: Mapping[str, Any]) -> Float[np.ndarray, " windows"]:
-    """Divide signal by noise, window by window, where there is some of both."""
+def pool_repeats(rows: Sequence[JsonObject], count: str) -> dict[str, metrics.Estimate]:
+    """Return the rate of `count` per 100 m of each learner, its seeds pooled, in the order of the rows."""
+    names = dict.fromkeys(row["learner"] for row in rows)
+    sums = {
+        name: [sum(row[key] for row in rows if row["learner"] == name) for key in (count, "distance")] for name in names
+    }
+    return {name: metrics.poisson_rate(total, distance / 100) for name, (total, distance) in sums.items()}
+
+
+def signal_to_noise(row: JsonObject) -> Float[np.ndarray, " windows"]:
+    """Return signal / noise of the windows in which both are known.
+
+    >>> signal_to_noise({"curve": {"signal": [3.0, 1.0], "noise": [1.5, 0.0]}})
+    array([2.])
+    """
     signal, noise = (np.array(row["curve"][name], float) for name in ("signal", "noise"))
-    sound = np.isfinite(signal) & (noise > 0)
-    return signal[sound] / noise[sound]
+    known = np.isfinite(signal) & (noise > 0)
+    return signal[known] / noise[known]
 
 
 @style.styled
-def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw what pupils touched and came near to, their loss while they were tuned, and how far to trust its slope."""
+def plot(rows: Sequence[JsonObject]) -> Figure:
+    """Plot collisions and approaches of the learners, their loss, and the gradient's signal / noise."""
     figure = Figure(figsize=(style.WIDTH, 5.6), layout="constrained")
-    (touched, near), (loss, ratio) = figure.subplots(2, 2)
-    _rates(touched, rows, "collisions", "per_100_m")
-    touched.set(xlabel="collisions per 100 m")
-    _rates(near, rows, "approaches", "near")
-    near.set(xlabel=f"nearer than {100 * dagger.TIGHT:g} cm, times per 100 m")
-    near.set_yticklabels([])
-    curves = [row for row in rows if "curve" in row]
-    for name in dict.fromkeys(row["pupil"] for row in curves if row["pupil"] in COLOURS):
-        some = [row["curve"] for row in curves if row["pupil"] == name]
-        time, value = (np.mean([_binned(curve[what]) for curve in some], axis=0) for what in ("seconds", "loss"))
-        loss.plot(time / 60, value, color=COLOURS[name], label=name)
-    loss.set(xlabel="simulated robot-minutes", ylabel="imitation loss of a window")
-    loss.legend()
-    for row in (row for row in curves if trust(row).size):
-        low, middle, high = np.quantile(trust(row), (0.25, 0.5, 0.75))
-        place = row["frames"] * 1.05 ** (list(COLOURS).index(_base(row["pupil"])) - 4)  # beside, not upon each other
-        ratio.plot([place, place], [low, high], color=_colour(row["pupil"]), alpha=0.5)
-        ratio.plot([place], [middle], "o", color=_colour(row["pupil"]), markersize=4.5)
-    ratio.axhline(1.0, color=style.QUIET, linewidth=1, linestyle=":")
-    ratio.set(xscale="log", xlabel="horizon [frames]", ylabel="signal / noise of the gradient", ylim=(0, None))
-    frames = sorted({row["frames"] for row in curves})
-    ratio.set_xticks(frames, list(map(str, frames)))
-    ratio.xaxis.set_minor_locator(NullLocator())
+    (collisions, approaches), (loss, ratio) = figure.subplots(2, 2)
+    _plot_rates(collisions, rows, "collisions", "per_100_m")
+    collisions.set(xlabel="collisions per 100 m")
+    _plot_rates(approaches, rows, "approaches", "approaches_per_100_m")
+    approaches.set(xlabel=f"closer than {100 * dagger.APPROACH_CLEARANCE:g} cm, times per 100 m")
+    approaches.set_yticklabels([])
+    finetuned = [row for row in rows if "curve" in row]
+    _plot_losses(loss, finetuned)
+    _plot_signal_to_noise(ratio, finetuned)
     return figure
 
 
-def _rates(axes: Axes, rows: Sequence[Mapping[str, Any]], count: str, rate: str) -> None:
-    """Draw rates by pupil: the starts together with their interval, and each start a dot."""
-    together = pooled(rows, count)
-    for y, (name, whole) in enumerate(together.items()):
-        axes.plot([whole.low, whole.high], [y, y], color=_colour(name), linewidth=1.6, alpha=0.6)
-        axes.plot([whole.value], [y], "|", color=_colour(name), markersize=11, markeredgewidth=2)
-        each = [row[rate]["value"] for row in rows if row["pupil"] == name]
+def _plot_rates(axes: Axes, rows: Sequence[JsonObject], count: str, rate: str) -> None:
+    """Plot rates by learner: the pooled rate with its interval, and a dot for each seed."""
+    pooled = pool_repeats(rows, count)
+    for y, (name, estimate) in enumerate(pooled.items()):
+        axes.plot([estimate.low, estimate.high], [y, y], color=_colour(name), linewidth=1.6, alpha=0.6)
+        axes.plot([estimate.value], [y], "|", color=_colour(name), markersize=11, markeredgewidth=2)
+        each = [row[rate]["value"] for row in rows if row["learner"] == name]
         axes.plot(each, [y] * len(each), "o", color=_colour(name), markersize=3.5, clip_on=False, zorder=3)
-    axes.set_yticks(range(len(together)), list(together))
-    axes.set(ylim=(len(together) - 0.5, -0.5), xlim=(0, None))
+    axes.set_yticks(range(len(pooled)), list(pooled))
+    axes.set(ylim=(len(pooled) - 0.5, -0.5), xlim=(0, None))
     axes.grid(False, axis="y")
+
+
+def _plot_losses(axes: Axes, rows: Sequence[JsonObject]) -> None:
+    """Plot the imitation loss against simulated time, averaged over the seeds of each learner."""
+    for name in dict.fromkeys(row["learner"] for row in rows if row["learner"] in COLOURS):
+        curves = [row["curve"] for row in rows if row["learner"] == name]
+        time, value = (np.mean([_binned(curve[key]) for curve in curves], axis=0) for key in ("seconds", "loss"))
+        axes.plot(time / 60, value, color=COLOURS[name], label=name)
+    axes.set(xlabel="simulated robot-minutes", ylabel="imitation loss of a window")
+    axes.legend()
+
+
+def _plot_signal_to_noise(axes: Axes, rows: Sequence[JsonObject]) -> None:
+    """Plot median and quartiles of signal / noise of every fit against its horizon."""
+    for row in (row for row in rows if signal_to_noise(row).size):
+        low, median, high = np.quantile(signal_to_noise(row), (0.25, 0.5, 0.75))
+        x = row["frames"] * 1.05 ** (list(COLOURS).index(_base(row["learner"])) - 4)  # next to each other
+        axes.plot([x, x], [low, high], color=_colour(row["learner"]), alpha=0.5)
+        axes.plot([x], [median], "o", color=_colour(row["learner"]), markersize=4.5)
+    axes.axhline(1.0, color=style.GREY, linewidth=1, linestyle=":")
+    axes.set(xscale="log", xlabel="horizon [frames]", ylabel="signal / noise of the gradient", ylim=(0, None))
+    frames = sorted({row["frames"] for row in rows})
+    axes.set_xticks(frames, list(map(str, frames)))
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _base(name: str) -> str:
@@ -250,6 +291,6 @@ def _colour(name: str) -> str:
 
 
 def _binned(column: Sequence[float]) -> Float[np.ndarray, " bins"]:
-    """Average a curve in bins of equal length; nan where nothing of a bin is finite."""
+    """Average a curve in bins of equal length; nan for a bin without finite values."""
     bins = np.array_split(np.array(column, float), min(BINS, len(column)))
     return np.array([np.mean(some[np.isfinite(some)]) if np.isfinite(some).any() else np.nan for some in bins])

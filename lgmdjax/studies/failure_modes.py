@@ -1,11 +1,11 @@
-"""Where the paper's robot fails, and what helps: a wall without contrast, and a corner (sec. 5.4).
+"""How often do a white wall and a corner stop the robot, and what helps? (sec. 5.4)
 
-A looming detector sees edges that spread. A plain wall has none but its rims, so nothing learned can help; here it is
-given contrast step by step. A corner is seen, by both eyes alike: which way to turn is then up to the driver. Eq. 22
-has nothing to choose by; the teacher of this package goes on turning the way it has begun to, and a network with a
-memory can learn that.
+An LGMD responds to expanding edges. A plain wall has no edges but its rims, so training cannot help; the study raises
+the wall's contrast step by step. A corner is visible, but both detectors respond alike, so the policy must choose the
+side. Eq. 22 has nothing to choose by. The teacher of this package goes on turning the way it has begun to, and a
+network with memory can learn that.
 
-Writes failures.json, a row a place, a contrast and a driver, and the walks.
+Writes failure_modes.json, a row for each trial, contrast and policy, and the walks.
 
 Source: Cizek & Faigl, sec. 5.4.
 """
@@ -13,78 +13,99 @@ Source: Cizek & Faigl, sec. 5.4.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lgmdjax.control import policies
 from lgmdjax.evaluation import run_trial, trials
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, recording
 from lgmdjax.studies import supervision
 from lgmdjax.studies.settings import FailureModesSettings
 
 CONTRASTS = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5)
-WAVELENGTH = 0.45  # m, of the wall's texture: the middle of what textured walls have
+WAVELENGTH = 0.45  # m, of the wall's texture: the mean of textured walls
 WHITE, CORNER = "white", "corner"
 EQ_22 = "eq. 22"
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: FailureModesSettings, seed: int) -> None:
-    """Walk into both, and count who got away."""
-    robot = assembly.with_eyes(assembly.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+class Case(NamedTuple):
+    """A trial, the policy that walks in it, and what is changed."""
 
-    def row(place: str, driver: policies.Driver, contrast: float | None = None, rule: str | None = None):
-        walker, name = (supervision.under(robot, rule) if rule else robot), rule or driver.name
-        rooms = trials.draw_rooms(place, settings.bench.robots, seed)
-        if contrast is not None:
-            rooms = papered(rooms, contrast)
-        label = f"{place}{'' if contrast is None else f' {contrast:g}'}"
-        facts = {"bench": asdict(settings.bench), "contrast": contrast, "robot": assembly.digest(walker)}
-        record = recording.walked(
-            folder / f"{label}-{name}".replace(" ", "-"), walker, rooms, settings.bench.seconds, driver,
-            seed=seed, facts=facts, label=label,
-        )  # fmt: skip
-        return {"place": place, "contrast": contrast, "driver": name} | run_trial.summary(trials.TRIALS[place], record)
-
-    rows = [row(WHITE, policies.LEARNED, contrast) for contrast in CONTRASTS]
-    rows += [row(WHITE, driver, 0.0) for driver in (policies.TEACHER, policies.BLIND)]
-    rows += [row(CORNER, driver) for driver in (policies.LEARNED, policies.TEACHER, policies.BLIND, policies.DIRECT)]
-    rows.append(row(CORNER, policies.TEACHER, rule=EQ_22))
-    storage.write_json(folder / "failure_modes.json", rows)
+    trial: str
+    policy: policies.Policy
+    contrast: float | None = None  # of all walls; None leaves them as they are
+    rule: str | None = None  # of `supervision.RULES`, for the policy `teacher`
 
 
-def papered(rooms: closed_loop.Room, contrast: float) -> closed_loop.Room:
-    """Give all walls a texture of some contrast."""
+CASES = (
+    *(Case(WHITE, policies.LEARNED, contrast) for contrast in CONTRASTS),
+    *(Case(WHITE, policy, 0.0) for policy in (policies.TEACHER, policies.BLIND)),
+    *(Case(CORNER, policy) for policy in (policies.LEARNED, policies.TEACHER, policies.BLIND, policies.DIRECT)),
+    Case(CORNER, policies.TEACHER, rule=EQ_22),
+)
+
+
+def run(folder: Path, inputs: Mapping[str, Path], settings: FailureModesSettings, seed: int) -> None:
+    """Record every case, and count the robots that touched nothing."""
+    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
+    storage.write_json(folder / "failure_modes.json", [_measure(folder, robot, case, settings, seed) for case in CASES])
+
+
+def _measure(
+    folder: Path, robot: closed_loop.Params, case: Case, settings: FailureModesSettings, seed: int
+) -> JsonObject:
+    """Return the row of a case."""
+    trial, policy, contrast, rule = case
+    robot, name = (supervision.with_rule(robot, rule) if rule else robot), rule or policy.name
+    rooms = trials.sample_rooms(trial, settings.benchmark.robots, seed)
+    if contrast is not None:
+        rooms = with_wall_contrast(rooms, contrast)
+    label = f"{trial}{'' if contrast is None else f' {contrast:g}'}"
+    facts = {
+        "benchmark": asdict(settings.benchmark), "contrast": contrast, "robot": assembly.fingerprint(robot)
+    }  # fmt: skip
+    record = recording.record_rollouts(
+        folder / f"{label}-{name}".replace(" ", "-"), robot, rooms, settings.benchmark.seconds, policy,
+        seed=seed, parameters=facts, label=label,
+    )  # fmt: skip
+    row = {"trial": trial, "contrast": contrast, "policy": name}
+    return row | run_trial.summarise(trials.TRIALS[trial], record)
+
+
+def with_wall_contrast(rooms: closed_loop.Room, contrast: float) -> closed_loop.Room:
+    """Give all walls a texture of the given contrast."""
     walls = rooms.arena.wall_texture.at[..., 1].set(contrast).at[..., 3].set(WAVELENGTH)
     return replace(rooms, arena=replace(rooms.arena, wall_texture=walls))
 
 
 @style.styled
-def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the share that got away, against contrast and by driver, with intervals; rows as in failures.json."""
+def plot(rows: Sequence[JsonObject]) -> Figure:
+    """Plot the share of robots that touched nothing, against contrast and by policy; rows as in failure_modes.json."""
     figure = Figure(figsize=(style.WIDTH, 2.6), layout="constrained")
     white, corner = figure.subplots(1, 2, sharey=True)
-    learned = [row for row in rows if row["place"] == WHITE and row["driver"] == policies.LEARNED.name]
-    _points(white, np.arange(len(learned)), learned)
+    learned = [row for row in rows if row["trial"] == WHITE and row["policy"] == policies.LEARNED.name]
+    _plot_shares(white, learned)
     white.set_xticks(range(len(learned)), [f"{row['contrast']:g}" for row in learned])
-    white.set(title="a wall ahead", xlabel="contrast of the wall", ylabel="got away [%]", ylim=(-4, 104))
-    for row in (row for row in rows if row["place"] == WHITE and row["driver"] != policies.LEARNED.name):
-        white.axhline(
-            100 * row["avoided"]["value"], color=style.DRIVERS[row["driver"]], linewidth=1, label=row["driver"]
-        )
+    white.set(title="a wall ahead", xlabel="contrast of the wall", ylabel="touched nothing [%]", ylim=(-4, 104))
+    for row in (row for row in rows if row["trial"] == WHITE and row["policy"] != policies.LEARNED.name):
+        options = {"color": style.POLICY_COLOURS[row["policy"]], "linewidth": 1}
+        white.axhline(100 * row["avoided"]["value"], label=row["policy"], **options)
     white.legend(loc="center right")
-    cornered = [row for row in rows if row["place"] == CORNER]
-    _points(corner, np.arange(len(cornered)), cornered)
-    corner.set_xticks(range(len(cornered)), [row["driver"] for row in cornered])
+    cornered = [row for row in rows if row["trial"] == CORNER]
+    _plot_shares(corner, cornered)
+    corner.set_xticks(range(len(cornered)), [row["policy"] for row in cornered])
     corner.set(title="a corner ahead")
     return figure
 
 
-def _points(axes: Any, x: np.ndarray, rows: Sequence[Mapping[str, Any]]) -> None:
-    for place, row in zip(x, rows, strict=True):
-        share, colour = row["avoided"], style.DRIVERS.get(row["driver"], style.INK)
-        axes.vlines(place, 100 * share["low"], 100 * share["high"], color=colour, alpha=0.5, linewidth=1.6)
-        axes.plot([place], [100 * share["value"]], "o", color=colour, markersize=4.5, clip_on=False, zorder=3)
+def _plot_shares(axes: Axes, rows: Sequence[JsonObject]) -> None:
+    """Plot the share of each row with its interval, side by side."""
+    for x, row in enumerate(rows):
+        share, colour = row["avoided"], style.POLICY_COLOURS.get(row["policy"], style.DARK)
+        axes.vlines(x, 100 * share["low"], 100 * share["high"], color=colour, alpha=0.5, linewidth=1.6)
+        axes.plot([x], [100 * share["value"]], "o", color=colour, markersize=4.5, clip_on=False, zorder=3)

@@ -1,4 +1,4 @@
-"""Settings of the studies."""
+"""Settings of the studies. Imports no JAX, so that the command line can."""
 
 from dataclasses import dataclass
 
@@ -9,78 +9,88 @@ from lgmdjax.simulation.settings import BenchmarkRooms
 
 @dataclass(frozen=True, kw_only=True)
 class VelocitySettings:
-    """The eyes of a robot that walks straight on, at multiples of the nominal velocity, as far at each."""
+    """LGMD response against walking velocity; every robot covers the same distance at each velocity."""
 
-    eyes: CameraSettings
-    robots: int
-    metres: float  # of each robot, at each velocity
+    eyes: CameraSettings  # the stereo camera
+    robots: int  # number of robots, each in a room of its own
+    distance: float  # distance that each robot walks at each velocity [m]
     velocities: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0)
+    """commanded velocities, as multiples of the nominal 0.05 m/s"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SupervisionSettings:
-    """Pupils of several rules and kinds: a lesson of the teacher's walks, then practice, from `seeds` starts each."""
+    """Navigators trained by several teaching rules, and networks of several kinds."""
 
-    bench: BenchmarkRooms
-    practice: TrainSettings
-    lesson_seconds: float  # of each robot
-    seeds: int
+    benchmark: BenchmarkRooms  # rooms in which robots are compared
+    dagger: TrainSettings  # DAgger rounds of each learner
+    demonstration_seconds: float  # duration of each robot's demonstration [s]
+    seeds: int  # number of random seeds for each case
 
 
 @dataclass(frozen=True, kw_only=True)
 class ErrataSettings:
-    """Robots with an erratum each."""
+    """Robots with one printed equation each."""
 
-    bench: BenchmarkRooms
+    benchmark: BenchmarkRooms  # rooms in which robots are compared
 
 
 @dataclass(frozen=True, kw_only=True)
 class FailureModesSettings:
-    """Robots before white walls and in corners."""
+    """Robots that walk toward a white wall or into a corner."""
 
-    bench: BenchmarkRooms
+    benchmark: BenchmarkRooms  # rooms in which robots are compared
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensitivitySettings:
-    """The robot with one thing changed at a time, and pupils of less data, from `seeds` starts each."""
+    """One parameter changed at a time, and learners trained on less data."""
 
-    bench: BenchmarkRooms
-    epochs: int  # of a fit to all data; see `studies.sensitivity.fair` for less
-    seeds: int
+    benchmark: BenchmarkRooms  # rooms in which robots are compared
+    epochs: int  # epochs of a fit to all data; fits to less data take more, see `sensitivity.matched_epochs`
+    seeds: int  # number of random seeds for each amount of data
+
+
+@dataclass(frozen=True, kw_only=True)
+class OverlapSettings:
+    """Width of each detector's field of view, on recorded walks and in front of a tube."""
+
+    robots: int  # robots of each recorded episode that are rendered again
+    seeds: int  # random seeds of the walks toward the tube, 30 walks each
+    overlaps: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 1.0)  # fractions of the picture's width
 
 
 @dataclass(frozen=True, kw_only=True)
 class GaitGradientSettings:
-    """The gait fitted through the body: by each method as many simulated seconds, from `seeds` starts."""
+    """Gait fitted through the physics, by gradient and by an evolution strategy, for the same simulated time."""
 
-    robot_seconds: float
-    window: float  # s, through which a derivative goes
-    learning_rate: float  # of weights as shares of their size; falls to nothing like half a cosine
-    clip: float  # largest norm of a slope
-    pairs: int  # of tries from which the evolution strategy estimates a slope
-    sigma: float  # by how much it tries, as a share of each weight's size
-    evolution_rate: float  # its learning rate
-    seeds: int
+    robot_seconds: float  # simulated time of each fit, all robots together [s]
+    window: float  # duration of the window that is differentiated [s]
+    learning_rate: float  # of the gradient method, in units of the parameters' RMS; decays by a half cosine to zero
+    clip: float  # largest norm of a gradient
+    pairs: int  # antithetic pairs in each gradient estimate of the evolution strategy
+    sigma: float  # perturbation of the evolution strategy, in units of the parameters' RMS
+    evolution_learning_rate: float  # learning rate of the evolution strategy, in the same units
+    seeds: int  # number of random seeds for each method
 
 
 @dataclass(frozen=True, kw_only=True)
 class GradientHorizonSettings:
-    """The derivative of a walk against the frames that it goes through, for so many robots."""
+    """Gradient of a closed-loop walk against the number of frames that it is taken through."""
 
-    eyes: CameraSettings
-    robots: int
+    eyes: CameraSettings  # the stereo camera
+    robots: int  # number of robots, each in a room of its own
 
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneSettings:
-    """The navigator tuned in the closed loop, and practised by DAgger for as long, from `seeds` starts."""
+    """The navigator finetuned in the closed loop, against DAgger for the same simulated time."""
 
-    bench: BenchmarkRooms
-    practice: TrainSettings  # rounds of DAgger, each as long as one room of a tune
-    lesson_seconds: float  # of each robot
-    window: int  # frames through which a derivative goes
-    horizons: tuple[int, ...]  # other windows, from the first start; all should go into round_seconds evenly
-    learning_rate: float  # a second of window, as a share of the weights' sizes
-    clip: float  # largest norm of one robot's gradient, as a multiple of the middle one
-    seeds: int
+    benchmark: BenchmarkRooms  # rooms in which robots are compared
+    dagger: TrainSettings  # DAgger rounds, each as long as one room of finetuning
+    demonstration_seconds: float  # duration of each robot's demonstration [s]
+    window: int  # frames through which the gradient is taken
+    horizons: tuple[int, ...]  # other windows [frames], tried with the first seed; each should divide a round evenly
+    learning_rate: float  # per second of window, in units of the parameters' size
+    clip: float  # largest norm of one robot's gradient, as a multiple of the robots' median
+    seeds: int  # number of random seeds

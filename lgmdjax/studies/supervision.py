@@ -1,13 +1,13 @@
-"""Which rule should teach, and what should learn? Navigators from several rules and of several kinds, in closed loop.
+"""Which rule should be the teacher, and which network should learn? Navigators compared in the closed loop.
 
 The paper says that vehicle 2a alone and vehicle 3b alone make poor controllers when learned (sec. 4.2), and that an
-LSTM does better than a feed-forward network and than the rule straight on u (sec. 3.4). Here each rule teaches an LSTM,
-from its own walks and then from the pupil's, and so does the rule that this package teaches by; by that one learn the
-other kinds of network as well. All get the same rooms, the same time and as many starts, so that a difference can be
-told from luck.
+LSTM does better than a feed-forward network and than the rule applied directly to u (sec. 3.4). Here each rule
+supervises an LSTM, first on its own walks and then on the learner's (DAgger), and so does the teacher of this package.
+The teacher of this package also supervises the other kinds of network. All cases get the same rooms, the same simulated
+time and the same number of random seeds, so that a difference can be distinguished from chance.
 
-Writes teaching.json: a row a case and seed, with the score of the pupil, and rows of the teachers and of the direct
-driver, which learns nothing.
+Writes supervision.json: a row for each case and seed with the score of the learner, a row for each rule that walks
+itself, and a row for the policy `direct`, which learns nothing.
 
 Source: Cizek & Faigl, sec. 3.4 and 4.2.
 """
@@ -15,23 +15,23 @@ Source: Cizek & Faigl, sec. 3.4 and 4.2.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from lgmdjax.control import braitenberg, navigator, policies
+from lgmdjax.control import braitenberg, names, policies
 from lgmdjax.evaluation import metrics
 from lgmdjax.learning import behaviour_cloning, dagger
 from lgmdjax.locomotion import cpg
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import compiled_code, storage
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, recording
 from lgmdjax.studies.settings import SupervisionSettings
 
-_PRINTED = braitenberg.Params(full_turn=0.0, symmetry=0.0)  # eq. 22 within the gait's range
+_PRINTED = braitenberg.Params(full_turn=0.0, tie_tolerance=0.0)  # eq. 22 within the gait's range
 RULES = {
     "2a": replace(_PRINTED, gain_3b=0.0),
     "3b": replace(_PRINTED, gain_2a=0.0),
@@ -42,10 +42,10 @@ RULES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """Who learns from whom."""
+    """A rule, and the kind of network that learns from it."""
 
     rule: str
-    variant: navigator.Variant
+    variant: names.Variant
 
 
 CASES = (
@@ -58,63 +58,69 @@ CASES = (
 )
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: SupervisionSettings, seed: int) -> None:
-    """Teach every case from every start, and score all on one bench."""
-    robot = assembly.with_eyes(assembly.trained(inputs["fit-gait"], inputs["train"]), settings.bench.eyes)
+def run(folder: Path, inputs: Mapping[str, Path], settings: SupervisionSettings, seed: int) -> None:
+    """Train every case with every random seed, and score all in the benchmark rooms."""
+    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     rows = []
     for rule in RULES:
-        rows.append(_score(folder / f"rule-{rule}", under(robot, rule), settings, policies.TEACHER, seed, rule=rule))
-    rows.append(_score(folder / "direct", robot, settings, policies.DIRECT, seed, rule="teacher"))
-    for number in range(settings.seeds):
+        ruled, facts = with_rule(robot, rule), {"rule": rule}
+        rows.append(_score(folder / f"rule-{rule}", ruled, settings, policies.TEACHER, seed, facts=facts))
+    rows.append(_score(folder / "direct", robot, settings, policies.DIRECT, seed, facts={"rule": "teacher"}))
+    for repeat in range(settings.seeds):
         for case in CASES:
-            place = folder / f"{case.rule}-{case.variant}-{number}"
-            pupil = teach(place, under(robot, case.rule), case.variant, settings, seed + number)
-            facts = {"rule": case.rule, "variant": case.variant, "start": number}
-            rows.append(_score(place / "bench", pupil, settings, policies.LEARNED, seed, **facts))
-        compiled_code.let_go()  # a start's fits and walks are two dozen
+            case_folder = folder / f"{case.rule}-{case.variant}-{repeat}"
+            learner = train_learner(case_folder, with_rule(robot, case.rule), case.variant, settings, seed + repeat)
+            facts = {"rule": case.rule, "variant": case.variant, "repeat": repeat}
+            walks = case_folder / "benchmark"
+            rows.append(_score(walks, learner, settings, policies.LEARNED, seed, facts=facts))
+        compiled_code.clear_caches_if_crowded()  # the fits and rollouts of one seed are two dozen programs
     storage.write_json(folder / "supervision.json", rows)
 
 
-def under(robot: closed_loop.Params, rule: str) -> closed_loop.Params:
-    """Put a robot under a rule, which labels its walks and drives when the teacher does."""
+def with_rule(robot: closed_loop.Params, rule: str) -> closed_loop.Params:
+    """Set the rule that labels the robot's walks, and that the policy `teacher` follows."""
     params = jax.tree.map(lambda value: jnp.asarray(value, float), RULES[rule])
-    return assembly.manned(replace(robot, teacher=params), params)
+    return assembly.with_policy(replace(robot, teacher=params), "teacher", params)
 
 
-def teach(
-    folder: Path, robot: closed_loop.Params, variant: navigator.Variant, settings: SupervisionSettings, seed: int
+def train_learner(
+    folder: Path, robot: closed_loop.Params, variant: names.Variant, settings: SupervisionSettings, seed: int
 ) -> closed_loop.Params:
-    """Let a robot's teacher walk, its pupil practise, and fit the pupil once more; give the robot with it aboard."""
-    school = settings.practice
-    facts = {"school": asdict(settings)}
-    walks = dagger.lesson(folder / "lesson", robot, school.robots, settings.lesson_seconds, seed, facts)
-    walks = dagger.practise(folder, robot, walks, school, seed, variant)
-    learned, test = dagger.learn(folder / "checkpoints" / "last", walks, school.epochs, seed, variant)
-    return assembly.manned(robot, behaviour_cloning.enliven(learned, test))
+    """Record demonstrations of the robot's teacher, train a navigator by DAgger, and return the robot with it."""
+    training, facts = settings.dagger, {"settings": asdict(settings)}
+    walks = dagger.record_demonstrations(
+        folder / "demonstrations",
+        robot,
+        robots=training.robots,
+        seconds=settings.demonstration_seconds,
+        seed=seed,
+        parameters=facts,
+    )
+    walks = dagger.run(folder, robot, walks, training, seed, variant=variant)
+    learned, test = dagger.fit_navigator(folder / "checkpoints" / "last", walks, training.epochs, seed, variant)
+    return assembly.with_policy(robot, "learned", behaviour_cloning.rescale_turns(learned, test))
 
 
 def _score(
-    folder: Path,
-    robot: closed_loop.Params,
-    settings: SupervisionSettings,
-    driver: policies.Driver,
-    seed: int,
-    **facts: Any,
-) -> dict[str, Any]:
-    record = recording.benched(folder, robot, settings.bench, driver, seed, label=" ".join(map(str, facts.values())))
-    return {"driver": driver.name, **facts} | asdict(metrics.score(record, cpg.CYCLE_TIME))
+    folder: Path, robot: closed_loop.Params, settings: SupervisionSettings, policy: policies.Policy, seed: int, *,
+    facts: JsonObject,
+) -> JsonObject:  # fmt: skip
+    """Record the robot in the benchmark rooms; return its row, which begins with the policy and `facts`."""
+    label = " ".join(map(str, facts.values()))
+    record = recording.record_benchmark(folder, robot, settings.benchmark, policy, seed, label=label)
+    return {"policy": policy.name, **facts} | asdict(metrics.score(record, cpg.CYCLE_TIME))
 
 
 @style.styled
-def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw collisions per 100 m of every case, a dot a start with its interval; rows as in teaching.json."""
-    names = list(dict.fromkeys(label(row) for row in rows))
+def plot(rows: Sequence[JsonObject]) -> Figure:
+    """Plot collisions per 100 m of every case, a dot with its interval for each seed; rows as in supervision.json."""
+    names = list(dict.fromkeys(case_label(row) for row in rows))
     figure = Figure(figsize=(style.WIDTH, 0.9 + 0.34 * len(names)), layout="constrained")
     axes = figure.subplots()
     for row in rows:
-        rate, start = row["per_100_m"], row.get("start", 0)
-        y = names.index(label(row)) + 0.16 * (start - 1 if "start" in row else 0)
-        colour = style.DRIVERS[row["driver"]]
+        rate = row["per_100_m"]
+        y = names.index(case_label(row)) + 0.16 * (row["repeat"] - 1 if "repeat" in row else 0)
+        colour = style.POLICY_COLOURS[row["policy"]]
         axes.plot([rate["low"], rate["high"]], [y, y], color=colour, linewidth=1.6, alpha=0.6)
         axes.plot([rate["value"]], [y], "o", color=colour, markersize=4.5, clip_on=False, zorder=3)
     axes.set_yticks(range(len(names)), names)
@@ -125,21 +131,25 @@ def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def label(row: Mapping[str, Any]) -> str:
-    """Name the case of a row."""
-    if row["driver"] == "learned":
+def case_label(row: JsonObject) -> str:
+    """Return the name of a row's case.
+
+    >>> case_label({"policy": "learned", "variant": "lstm", "rule": "2a"})
+    'lstm, taught by 2a'
+    """
+    if row["policy"] == "learned":
         return f"{row['variant']}, taught by {row['rule']}"
-    return "direct, nothing learned" if row["driver"] == "direct" else f"{row['rule']} itself, on the laser"
+    return "direct, no learning" if row["policy"] == "direct" else f"{row['rule']} itself, with the laser"
 
 
-def pooled(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Sum collisions and ways of the starts of each case, in the order of the rows, with the rates of each start."""
-    cases: dict[str, list[Mapping[str, Any]]] = {}
+def pool_repeats(rows: Sequence[JsonObject]) -> dict[str, JsonObject]:
+    """Sum collisions and distances over the seeds of each case, in the order of the rows; list the rate of each."""
+    cases: dict[str, list[JsonObject]] = {}
     for row in rows:
-        cases.setdefault(label(row), []).append(row)
+        cases.setdefault(case_label(row), []).append(row)
     return {
         name: {
-            "starts": len(some),
+            "repeats": len(some),
             "distance": sum(row["distance"] for row in some),
             "collisions": sum(row["collisions"] for row in some),
             "per_100_m": asdict(

@@ -1,13 +1,16 @@
-"""How fast should the robot walk for its eyes? Fig. 9: the mean response of the detectors against velocity.
+"""At which velocity do the detectors best distinguish an obstructed from a free path? Fig. 9: u against velocity.
 
-A robot that looks at nothing walks straight on through random rooms at 0.1 to 5 times the nominal velocity, as far at
-each. A frame counts as obstructed when something stands within `NEAR` of the laser in a sector straight ahead, as free
-when nothing does within `FAR`; the mean response of both eyes, averaged over about a gait cycle, is compared between
-the two. Where they are furthest apart in standard deviations (Cohen's d), the detector tells best whether the way is
-free. Intervals are bootstrapped over robots: frames of one walk are alike. Rooms differ much more than velocities do,
-so velocities are compared in the same ones: one is as good as the best unless it is worse in 97.5 % of the resamples.
+Robots with the policy `blind` walk straight on through random rooms at 0.1 to 5 times the nominal velocity, the same
+distance at each. A frame counts as obstructed if the laser finds something within `NEAR` in a sector straight ahead,
+and as free if it finds nothing within `FAR`. Compared is u, the mean of both detectors averaged over about a gait
+cycle. The effect size is Cohen's d, the difference of the two means in pooled standard deviations: the larger it is,
+the better u shows whether the path is free.
 
-Writes velocity.json, a row a velocity, and the walks.
+Intervals are bootstrapped over robots, because the frames of one walk are correlated. Rooms differ much more than
+velocities do, so all velocities are compared in the same rooms: a velocity is as good as the best one unless its effect
+size is smaller in 97.5 % of the resamples.
+
+Writes velocity.json, a row for each velocity, and the walks.
 
 Source: Cizek & Faigl, sec. 4.2 and fig. 9.
 """
@@ -16,7 +19,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +33,7 @@ from lgmdjax.evaluation import metrics
 from lgmdjax.locomotion import cpg, tripod_gait
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import laser
 from lgmdjax.simulation import assembly, closed_loop, recording, room_batches
 from lgmdjax.simulation.settings import BenchmarkRooms
@@ -38,80 +41,88 @@ from lgmdjax.studies.settings import VelocitySettings
 from lgmdjax.world import arena
 
 NEAR, FAR = 0.6, 1.2  # m
-SECTOR = math.radians(40.0)  # straight ahead
-WINDOW = round(metrics.AVERAGED * closed_loop.FRAME_RATE)
-LEAST = 10.0  # s of a walk, however fast
-RESAMPLED = 1000
-BAND = (1.0, 1.4)  # of the nominal velocity: where the paper finds the two furthest apart
+SECTOR = math.radians(40.0)  # rad, straight ahead
+WINDOW = round(metrics.AVERAGING_TIME * closed_loop.FRAME_RATE)  # frames
+MIN_SECONDS = 10.0  # of a walk, however fast
+RESAMPLES = 1000
+PAPER_BEST = (1.0, 1.4)  # v; in this range the paper finds the largest difference
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What the eyes say at one velocity, where the way is obstructed and where it is free; nan where it never was."""
+    """The response at one velocity, in obstructed and in free frames; nan without frames of both kinds."""
 
-    velocity: float  # asked for
-    speed: float  # m/s, walked
-    obstructed: float  # mean u
-    free: float
-    spread: float  # standard deviation of u, both pooled
+    velocity: float  # commanded, as a multiple of the nominal velocity
+    speed: float  # m/s, measured
+    obstructed: float  # mean u of obstructed frames
+    free: float  # mean u of free frames
+    spread: float  # pooled standard deviation of u
     effect: float  # Cohen's d
-    low: float  # of its 95 % interval
-    high: float
-    as_good: bool  # as the best velocity, as far as these rooms can tell
-    frames: tuple[int, int]  # obstructed, free
-    silenced: float  # share of the frames in which the gate was shut
+    low: float  # lower end of its 95 % interval
+    high: float  # upper end
+    as_good: bool  # not worse than the best velocity in 97.5 % of the resamples
+    frames: tuple[int, int]  # number of obstructed and of free frames
+    suppressed: float  # share of frames in which the feed-forward inhibition exceeds T_f
     lost: int  # robots that fell
 
 
-def work(folder: Path, inputs: Mapping[str, Path], settings: VelocitySettings, seed: int) -> None:
-    """Walk at every velocity through the same rooms, and compare."""
-    robot = assembly.with_eyes(assembly.trained(inputs["fit-gait"], inputs["train"]), settings.eyes)
+def run(folder: Path, inputs: Mapping[str, Path], settings: VelocitySettings, seed: int) -> None:
+    """Record walks at every velocity in the same rooms, and compare the responses."""
+    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.eyes)
     measured = []
     for velocity in settings.velocities:
-        seconds = max(settings.metres / (velocity * float(tripod_gait.Gait().nominal_velocity)), LEAST)
-        bench = BenchmarkRooms(eyes=settings.eyes, robots=settings.robots, seconds=seconds)
-        record = recording.benched(
-            folder / f"{velocity:g}", at_velocity(robot, velocity), bench, policies.BLIND, seed,
-            label=f"v = {velocity:g}", draw=True,
+        seconds = max(settings.distance / (velocity * float(tripod_gait.Gait().nominal_velocity)), MIN_SECONDS)
+        benchmark = BenchmarkRooms(eyes=settings.eyes, robots=settings.robots, seconds=seconds)
+        record = recording.record_benchmark(
+            folder / f"{velocity:g}", with_velocity(robot, velocity), benchmark, policies.BLIND, seed,
+            label=f"v = {velocity:g}", render=True,
         )  # fmt: skip
-        free = ahead(room_batches.bench_rooms(bench, seed).arena, record)
-        measured.append(measure(velocity, record, free, float(robot.controller.lgmd.suppression)))
-    storage.write_json(folder / "velocity.json", [asdict(row) for row in compared(measured)])
+        ahead = distance_ahead(room_batches.benchmark_rooms(benchmark, seed).arena, record)
+        measured.append(score_velocity(velocity, record, ahead, float(robot.controller.lgmd.suppression)))
+    storage.write_json(folder / "velocity.json", [asdict(row) for row in mark_best(measured)])
 
 
-def at_velocity(robot: closed_loop.Params, velocity: float) -> closed_loop.Params:
-    """Have the blind driver walk straight on at a velocity."""
-    return assembly.manned(robot, policies.Blind(velocity=jnp.full(2, velocity, dtype=float)))
+def with_velocity(robot: closed_loop.Params, velocity: float) -> closed_loop.Params:
+    """Set the velocity at which the policy `blind` walks straight on."""
+    return assembly.with_policy(robot, "blind", policies.BlindParams(velocity=jnp.full(2, velocity, dtype=float)))
 
 
-def ahead(rooms: arena.Arena, record: closed_loop.Record) -> Float[np.ndarray, "robots frames"]:
-    """Measure how far it is from the laser to the first thing in a sector straight ahead [m]."""
-    scanner = laser.Params(rays=21, field_of_view=SECTOR)
+def distance_ahead(rooms: arena.Arena, record: closed_loop.Record) -> Float[np.ndarray, "robots frames"]:
+    """Measure the distance from the laser to the nearest thing in a sector straight ahead [m]."""
+    scanner = laser.Params(rays=21, fov=SECTOR)
 
-    def look(room: arena.Arena, position: Array, quaternion: Array) -> Array:
+    def nearest(room: arena.Arena, position: Array, quaternion: Array) -> Array:
         pose = hexapod.Pose(position=position, quaternion=quaternion)
         return jnp.min(laser.scan(scanner, room, *hexapod.laser_pose(pose)))
 
-    walk = jax.vmap(look, in_axes=(None, 0, 0))
+    nearest_by_frame = jax.vmap(nearest, in_axes=(None, 0, 0))
     poses = (jnp.asarray(record.position), jnp.asarray(record.quaternion))
-    return np.asarray(jax.jit(lambda *walks: jax.lax.map(lambda one: walk(*one), walks))(rooms, *poses))
+    by_robot = jax.jit(lambda *walks: jax.lax.map(lambda walk: nearest_by_frame(*walk), walks))
+    return np.asarray(by_robot(rooms, *poses))
 
 
-def measure(
+def score_velocity(
     velocity: float, record: closed_loop.Record, ahead: Float[np.ndarray, "robots frames"], suppression: float
 ) -> tuple[Row, Float[np.ndarray, " resamples"]]:
-    """Compare u where something is near ahead with u where nothing is; give d of the resamples too."""
+    """Compare u between obstructed and free frames; return the row, and Cohen's d of each bootstrap resample.
+
+    Args:
+        velocity: commanded, as a multiple of the nominal velocity.
+        record: the walks at this velocity.
+        ahead: from `distance_ahead` [m].
+        suppression: T_f of the detectors [grey].
+    """
     u = ndimage.uniform_filter1d(np.asarray(record.u).mean(axis=-1), WINDOW, axis=1)
-    steady = _steady(record)
-    near, far = (_moments(u, steady & there) for there in (ahead < NEAR, ahead > FAR))
-    obstructed, free, spread, effect = _compare(near.sum(axis=0), far.sum(axis=0))
-    chosen = np.random.default_rng(0).integers(0, len(u), (RESAMPLED, len(u)))
-    effects = np.array([_compare(near[some].sum(axis=0), far[some].sum(axis=0))[-1] for some in chosen])
+    steady = _steady_frames(record)
+    near, far = (_moments(u, steady & selected) for selected in (ahead < NEAR, ahead > FAR))
+    obstructed, free, spread, effect = _effect_size(near.sum(axis=0), far.sum(axis=0))
+    drawn = np.random.default_rng(0).integers(0, len(u), (RESAMPLES, len(u)))
+    effects = np.array([_effect_size(near[robots].sum(axis=0), far[robots].sum(axis=0))[-1] for robots in drawn])
     low, high = np.nanpercentile(effects, (2.5, 97.5)) if np.any(np.isfinite(effects)) else (math.nan, math.nan)
-    scored, silenced = metrics.score(record, cpg.CYCLE_TIME), np.asarray(record.feed_forward)[steady] > suppression
+    score, suppressed = metrics.score(record, cpg.CYCLE_TIME), np.asarray(record.feed_forward)[steady] > suppression
     row = Row(
         velocity=velocity,
-        speed=scored.speed,
+        speed=score.speed,
         obstructed=obstructed,
         free=free,
         spread=spread,
@@ -120,74 +131,74 @@ def measure(
         high=float(high),
         as_good=False,
         frames=(int(near[:, 0].sum()), int(far[:, 0].sum())),
-        silenced=float(silenced.mean()) if silenced.size else math.nan,
-        lost=scored.lost,
+        suppressed=float(suppressed.mean()) if suppressed.size else math.nan,
+        lost=score.lost,
     )
     return row, effects
 
 
-def compared(measured: Sequence[tuple[Row, Float[np.ndarray, " resamples"]]]) -> list[Row]:
-    """Tell which velocities are as good as the best; resamples of all are of the same robots, hence the same rooms."""
+def mark_best(measured: Sequence[tuple[Row, Float[np.ndarray, " resamples"]]]) -> list[Row]:
+    """Return the rows with `as_good` set; one resample holds the same robots, hence rooms, at all velocities."""
     rows, effects = [row for row, _ in measured], np.array([effects for _, effects in measured])
-    first = _furthest([row.effect for row in rows])
-    worse = np.mean(effects < effects[first], axis=1)  # a resample without frames of both kinds is for none
+    best = _argmax([row.effect for row in rows])
+    worse = np.mean(effects < effects[best], axis=1)  # a resample without frames of both kinds counts for none
     return [
         replace(row, as_good=math.isfinite(row.effect) and bool(share < 0.975))
         for row, share in zip(rows, worse, strict=True)
     ]
 
 
-def _moments(u: Float[np.ndarray, "robots frames"], there: Bool[np.ndarray, "robots frames"]) -> np.ndarray:
-    """Count the frames of each robot, and sum u and its square over them; shape (robots, 3)."""
-    return np.stack([np.where(there, u**power, 0.0).sum(axis=1) for power in range(3)], axis=1)
+def _moments(u: Float[np.ndarray, "robots frames"], selected: Bool[np.ndarray, "robots frames"]) -> np.ndarray:
+    """Return for each robot the number of selected frames, and the sums of u and u^2 over them; shape (robots, 3)."""
+    return np.stack([np.where(selected, u**power, 0.0).sum(axis=1) for power in range(3)], axis=1)
 
 
-def _compare(near: np.ndarray, far: np.ndarray) -> tuple[float, float, float, float]:
-    """Give both means, the pooled standard deviation, and Cohen's d; nan without frames of both kinds."""
+def _effect_size(near: np.ndarray, far: np.ndarray) -> tuple[float, float, float, float]:
+    """Return both means, the pooled standard deviation, and Cohen's d; nan without frames of both kinds."""
     if not (near[0] and far[0]):
         return math.nan, math.nan, math.nan, math.nan
     means = near[1] / near[0], far[1] / far[0]
-    squares = sum(some[2] - some[1] ** 2 / some[0] for some in (near, far))
+    squares = sum(moments[2] - moments[1] ** 2 / moments[0] for moments in (near, far))
     spread = math.sqrt(max(squares, 0.0) / (near[0] + far[0]))
     return float(means[0]), float(means[1]), spread, float((means[0] - means[1]) / max(spread, 1e-9))
 
 
-def _steady(record: closed_loop.Record) -> Bool[np.ndarray, "robots frames"]:
-    """Leave out the first two seconds after a robot was put down, the frames before a touch, and robots that fell."""
-    setbacks = np.asarray(record.setbacks)
-    steady = np.zeros(setbacks.shape, bool)
-    for robot, first, last in metrics.stretches(setbacks):
+def _steady_frames(record: closed_loop.Record) -> Bool[np.ndarray, "robots frames"]:
+    """Select all frames but the first two seconds after a reset, those before a contact, and those of fallen robots."""
+    resets = np.asarray(record.resets)
+    steady = np.zeros(resets.shape, bool)
+    for robot, first, last in metrics.segment_bounds(resets):
         steady[robot, first + 2 * round(closed_loop.FRAME_RATE) : max(last - WINDOW, 0)] = True
     return steady & np.asarray(record.ok)
 
 
-def best(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Find the row at whose velocity the two are furthest apart."""
-    return rows[_furthest([row["effect"] for row in rows])]
+def best_row(rows: Sequence[JsonObject]) -> JsonObject:
+    """Return the row with the largest effect size."""
+    return rows[_argmax([row["effect"] for row in rows])]
 
 
-def _furthest(effects: Sequence[float]) -> int:
+def _argmax(effects: Sequence[float]) -> int:
     return int(np.argmax(np.where(np.isfinite(effects), effects, -math.inf)))
 
 
 @style.styled
-def draw(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the mean responses with their spread, and how far apart they are; rows as in velocity.json."""
+def plot(rows: Sequence[JsonObject]) -> Figure:
+    """Plot mean and spread of u in obstructed and free frames, and the effect size; rows as in velocity.json."""
     names = ("velocity", "spread", "effect", "low", "high")
     velocity, spread, effect, low, high = (np.array([row[name] for row in rows]) for name in names)
     figure = Figure(figsize=(style.WIDTH, 4.4), layout="constrained")
     means, effects = figure.subplots(2, sharex=True)
-    for name, colour in (("obstructed", style.RIGHT), ("free", style.LEFT)):
+    for name, colour in (("obstructed", style.RIGHT_COLOUR), ("free", style.LEFT_COLOUR)):
         mean: Float[np.ndarray, " rows"] = np.array([row[name] for row in rows])
         means.plot(velocity, mean, "o-", color=colour, label=f"{name} path")
         means.fill_between(velocity, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
     means.set(ylabel="mean response u")
     means.legend()
     good = np.array([row["as_good"] for row in rows])
-    effects.plot(velocity, effect, "o-", color=style.INK, markerfacecolor="white", label="worse than the best")
-    effects.plot(velocity[good], effect[good], "o", color=style.INK, label="as good as the best")
-    effects.fill_between(velocity, low, high, color=style.INK, alpha=0.12, linewidth=0)
-    effects.axvspan(*BAND, color=style.FAINT, alpha=0.5, linewidth=0, label="the paper's best")
+    effects.plot(velocity, effect, "o-", color=style.DARK, markerfacecolor="white", label="worse than the best")
+    effects.plot(velocity[good], effect[good], "o", color=style.DARK, label="as good as the best")
+    effects.fill_between(velocity, low, high, color=style.DARK, alpha=0.12, linewidth=0)
+    effects.axvspan(*PAPER_BEST, color=style.LIGHT_GREY, alpha=0.5, linewidth=0, label="best in the paper")
     effects.set(xlabel="velocity [0.05 m/s]", ylabel="Cohen's d", xscale="log")
     effects.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     effects.legend()

@@ -1,19 +1,18 @@
-"""Upright prisms as padded arrays: boxes turned about the vertical, or cylinders; and the distance to them.
+"""Upright prisms as padded arrays, boxes (rotated about the vertical) or cylinders, and the distance to them.
 
-Two convex shapes are as far apart as the origin is from their Minkowski sum (one of them mirrored). For a
-segment and a box that sum is a hexagon with the normals of the box and of the segment, so the greatest
-separation along these three normals tells whether they overlap and, if so, how deep; a segment and a disc
-make a stadium.
+The distance between two convex shapes is that of the origin from their Minkowski difference. For a segment and a box
+this is a hexagon with the normals of the box and of the segment. The greatest separation along these three normals
+therefore decides whether the two overlap, and gives the depth of the overlap. For a segment and a disc it is a stadium.
 
 | symbol | name                                      | unit | where                                         |
 | ------ | ----------------------------------------- | ---- | --------------------------------------------- |
 | c(t)   | centre of a prism at time t               | m    | c + s (goal - c), s clipped to 0..1           |
-| s      | share of the way that is done             | 1    | (t - departs)/(arrives - departs)             |
-| a, b   | half sizes of a box in its own frame      | m    | a cylinder has its radius twice               |
+| s      | completed fraction of the motion          | 1    | (t - departs)/(arrives - departs)             |
+| a, b   | half sizes of a box in its own frame      | m    | a cylinder stores its radius twice            |
 | psi    | yaw of a prism                            | rad  |                                               |
 | p, q   | ends of a segment, in the box's frame     | m    |                                               |
-| m, h   | its middle, half of q - p                 | m    |                                               |
-| n      | its unit normal (one of the box if p = q) | 1    |                                               |
+| m, h   | midpoint of the segment, (q - p)/2        | m    |                                               |
+| n      | its unit normal (of the box if p = q)     | 1    |                                               |
 """
 
 import dataclasses
@@ -26,73 +25,80 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from lgmdjax.errors import InputError
+from lgmdjax.geometry import rotate, safe_norm
 
-COUNT = 12
-"""Rows of a set, unless said otherwise."""
-PARKED = 1.0e3
-"""Where padding is parked: x = y = 1 km [m]."""
-TEXTURE = ("brightness", "contrast", "phase", "scale")
-"""Columns of a texture row: mean grey 0..255, contrast 0..1, pattern offset [rad], longest wavelength [m]."""
-PLAIN = (128.0, 0.0, 0.0, 0.5)
+CAPACITY = 12
+"""Default number of rows of a set."""
+INACTIVE_POSITION = 1.0e3
+"""Position of inactive prisms: x = y = 1 km [m]."""
+TEXTURE_COLUMNS = ("brightness", "contrast", "phase", "scale")
+"""Columns of a texture row: mean grey level 0..255, contrast 0..1, phase [rad], longest wavelength [m]."""
+PLAIN_TEXTURE = (128.0, 0.0, 0.0, 0.5)
 
 
 @struct.dataclass(kw_only=True)
 class Prisms:
-    """A padded set of upright prisms of one kind; at time t each is on its way from `centre` to `goal`."""
+    """A padded set of upright prisms of one kind, each of which may move once from `centre` to `goal`.
 
-    centre: Float[Array, "n 2"]
-    half_size: Float[Array, "n 2"]
-    yaw: Float[Array, " n"]
-    bottom: Float[Array, " n"]
+    The motion is straight and uniform, from time `departs` to time `arrives` [s].
+    """
+
+    centre: Float[Array, "n 2"]  # m
+    half_size: Float[Array, "n 2"]  # m; the radius twice for a cylinder
+    yaw: Float[Array, " n"]  # rad
+    bottom: Float[Array, " n"]  # m above the floor
     top: Float[Array, " n"]
-    texture: Float[Array, "n 4"]
-    goal: Float[Array, "n 2"]
-    departs: Float[Array, " n"]
+    texture: Float[Array, "n 4"]  # columns as in `TEXTURE_COLUMNS`
+    goal: Float[Array, "n 2"]  # m
+    departs: Float[Array, " n"]  # s
     arrives: Float[Array, " n"]
 
 
-def place(
+def make_prisms(
     centre: ArrayLike,
     half_size: ArrayLike,
     top: ArrayLike,
     *,
     yaw: ArrayLike = 0.0,
     bottom: ArrayLike = 0.0,
-    texture: ArrayLike = PLAIN,
+    texture: ArrayLike = PLAIN_TEXTURE,
     goal: ArrayLike | None = None,
     departs: ArrayLike = 0.0,
     arrives: ArrayLike = 0.0,
-    count: int = COUNT,
+    capacity: int = CAPACITY,
 ) -> Prisms:
-    """Set up prisms at `centre` (n, 2), the rest broadcast to n rows, padded with parked ones to `count`.
+    """Make prisms at `centre` (n, 2); other values are broadcast to n rows. Pad with inactive prisms to `capacity`.
 
-    Raises InputError if there are more than `count`.
+    Raises InputError if n exceeds `capacity`.
+
+    >>> is_inactive(make_prisms([[1.0, 0.0]], 0.1, 0.8, capacity=3)).tolist()
+    [False, True, True]
     """
     centre = jnp.asarray(centre, dtype=float).reshape(-1, 2)
     rows = centre.shape[0]
-    if rows > count:
-        raise InputError(f"expected at most {count} prisms of a kind, got {rows}; raise `count`")
+    if rows > capacity:
+        raise InputError(f"expected at most {capacity} prisms of one kind, got {rows}; increase `capacity`")
 
-    def fill(value: ArrayLike, *width: int) -> Array:
+    def broadcast(value: ArrayLike, *width: int) -> Array:
         return jnp.broadcast_to(jnp.asarray(value, dtype=float), (rows, *width))
 
-    real = Prisms(
+    active = Prisms(
         centre=centre,
-        half_size=fill(half_size, 2),
-        yaw=fill(yaw),
-        bottom=fill(bottom),
-        top=fill(top),
-        texture=fill(texture, 4),
-        goal=centre if goal is None else fill(goal, 2),
-        departs=fill(departs),
-        arrives=fill(arrives),
+        half_size=broadcast(half_size, 2),
+        yaw=broadcast(yaw),
+        bottom=broadcast(bottom),
+        top=broadcast(top),
+        texture=broadcast(texture, 4),
+        goal=centre if goal is None else broadcast(goal, 2),
+        departs=broadcast(departs),
+        arrives=broadcast(arrives),
     )
-    return join(real, parked(count - rows))
+    return concatenate(active, inactive(capacity - rows))
 
 
-def parked(count: int = COUNT) -> Prisms:
-    """Padding: `count` small plain prisms far away under the floor, where no ray or robot meets them."""
-    far = jnp.full((count, 2), PARKED, dtype=float)
+def inactive(count: int = CAPACITY) -> Prisms:
+    """Return `count` inactive prisms: small, plain, far away and below the floor, out of reach of rays and robots."""
+    far = jnp.full((count, 2), INACTIVE_POSITION, dtype=float)
     zero = jnp.zeros(count, dtype=float)
     return Prisms(
         centre=far,
@@ -100,62 +106,66 @@ def parked(count: int = COUNT) -> Prisms:
         yaw=zero,
         bottom=zero - 0.2,
         top=zero - 0.1,
-        texture=jnp.broadcast_to(jnp.asarray(PLAIN, dtype=float), (count, 4)),
+        texture=jnp.broadcast_to(jnp.asarray(PLAIN_TEXTURE, dtype=float), (count, 4)),
         goal=far,
         departs=zero,
         arrives=zero,
     )
 
 
-def is_parked(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
-    """Tell which prisms are padding."""
+def is_inactive(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
+    """Return which prisms are padding."""
     return prisms.top <= 0
 
 
-def join(first: Prisms, second: Prisms) -> Prisms:
-    """Append one set to another of its kind."""
+def concatenate(first: Prisms, second: Prisms) -> Prisms:
+    """Concatenate two sets of one kind."""
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
-def moved(prisms: Prisms, time: ArrayLike) -> Prisms:
-    """Move prisms to where they are at `time` [s]; they stand there. They jump if arrives = departs."""
+def move_prisms(prisms: Prisms, time: ArrayLike) -> Prisms:
+    """Return the prisms where they are at `time` [s], at rest there. They jump where arrives = departs."""
     duration = prisms.arrives - prisms.departs
-    walks = duration > 0
-    late = jnp.asarray(time, dtype=duration.dtype) - prisms.departs
-    share = jnp.clip(late / jnp.where(walks, duration, 1.0), 0.0, 1.0)
-    share = jnp.where(walks, share, jnp.where(late >= 0, 1.0, 0.0))
-    centre = prisms.centre + share[..., None] * (prisms.goal - prisms.centre)
+    is_gradual = duration > 0
+    elapsed = jnp.asarray(time, dtype=duration.dtype) - prisms.departs
+    fraction = jnp.clip(elapsed / jnp.where(is_gradual, duration, 1.0), 0.0, 1.0)
+    fraction = jnp.where(is_gradual, fraction, jnp.where(elapsed >= 0, 1.0, 0.0))
+    centre = prisms.centre + fraction[..., None] * (prisms.goal - prisms.centre)
     return dataclasses.replace(prisms, centre=centre, goal=centre)
 
 
-def mirrored(prisms: Prisms) -> Prisms:
-    """Reflect prisms in the x axis."""
+def mirror_prisms(prisms: Prisms) -> Prisms:
+    """Return the mirror image of prisms in the x axis."""
     flip = jnp.asarray([1.0, -1.0], dtype=prisms.yaw.dtype)
     return dataclasses.replace(prisms, centre=prisms.centre * flip, goal=prisms.goal * flip, yaw=-prisms.yaw)
 
 
 def distance_to_boxes(boxes: Prisms, starts: Float[Array, "s 2"], ends: Float[Array, "s 2"]) -> Float[Array, "s n"]:
-    """Measure the signed distance [m] of plane segments to boxes' footprints, negative where they overlap.
+    """Return the signed distance [m] of plane segments to the footprints of boxes, negative where they overlap.
 
-    Depth is the shortest shift that parts them. A segment may be a point.
-    Gradient: one of the one-sided ones where two features are equally near.
+    The depth of an overlap is the length of the shortest shift that separates the two. A segment may be a point.
+
+    Gradient: one of the one-sided gradients where two features are equally near.
     """
-    p = turned(starts[:, None] - boxes.centre, -boxes.yaw)
-    q = turned(ends[:, None] - boxes.centre, -boxes.yaw)
+    p = rotate(starts[:, None] - boxes.centre, -boxes.yaw)
+    q = rotate(ends[:, None] - boxes.centre, -boxes.yaw)
     m, h = 0.5 * (p + q), 0.5 * (q - p)
     along_box = jnp.max(jnp.abs(m) - boxes.half_size - jnp.abs(h), axis=-1)
-    length = _norm(h)
-    point = length == 0
-    n = jnp.stack([-h[..., 1], h[..., 0]], axis=-1) / jnp.where(point, 1.0, length)[..., None]
-    n = jnp.where(point[..., None], jnp.asarray([1.0, 0.0], dtype=n.dtype), n)
+    length = safe_norm(h)
+    is_point = length == 0
+    n = jnp.stack([-h[..., 1], h[..., 0]], axis=-1) / jnp.where(is_point, 1.0, length)[..., None]
+    n = jnp.where(is_point[..., None], jnp.asarray([1.0, 0.0], dtype=n.dtype), n)
     along_segment = jnp.abs(jnp.sum(n * m, axis=-1)) - jnp.sum(boxes.half_size * jnp.abs(n), axis=-1)
     separation = jnp.maximum(along_box, along_segment)
-    return jnp.where(separation > 0, _distance_apart(p, q, boxes.half_size), separation)
+    return jnp.where(separation > 0, _distance_outside(p, q, boxes.half_size), separation)
 
 
-def _distance_apart(p: Array, q: Array, half_size: Array) -> Array:
-    """Distance of a segment to a box about the origin, apart from it: an end or a corner is nearest."""
-    from_ends = jnp.minimum(*(_norm(jnp.maximum(jnp.abs(end) - half_size, 0.0)) for end in (p, q)))
+def _distance_outside(p: Array, q: Array, half_size: Array) -> Array:
+    """Return the distance of a segment to a box at the origin that it does not overlap.
+
+    The nearest point is an end of the segment or a corner of the box.
+    """
+    from_ends = jnp.minimum(*(safe_norm(jnp.maximum(jnp.abs(end) - half_size, 0.0)) for end in (p, q)))
     signs = [[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]
     corners = half_size[..., None, :] * jnp.asarray(signs, dtype=half_size.dtype)
     from_corners = _point_to_segment(corners, p[..., None, :], q[..., None, :])
@@ -165,7 +175,7 @@ def _distance_apart(p: Array, q: Array, half_size: Array) -> Array:
 def distance_to_cylinders(
     cylinders: Prisms, starts: Float[Array, "s 2"], ends: Float[Array, "s 2"]
 ) -> Float[Array, "s n"]:
-    """Measure the signed distance [m] of plane segments to cylinders' footprints, negative inside.
+    """Return the signed distance [m] of plane segments to the footprints of cylinders, negative where they overlap.
 
     Gradient: zero where the cylinder's axis lies on the segment.
     """
@@ -174,21 +184,8 @@ def distance_to_cylinders(
 
 
 def _point_to_segment(point: Array, start: Array, end: Array) -> Array:
-    along = end - start
-    square = jnp.sum(along * along, axis=-1)
-    share = jnp.sum((point - start) * along, axis=-1) / jnp.where(square > 0, square, 1.0)
-    return _norm(point - start - jnp.clip(share, 0.0, 1.0)[..., None] * along)
-
-
-def _norm(vector: Array) -> Array:
-    """Length of plane vectors, with gradient zero at zero, where there is none."""
-    square = jnp.sum(vector * vector, axis=-1)
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
-
-
-def turned(vector: Float[Array, "*#shape 2"], angle: Float[Array, "*#shape"]) -> Float[Array, "*shape 2"]:
-    """Turn plane vectors by `angle` [rad], counter-clockwise."""
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    x, y = vector[..., 0], vector[..., 1]
-    return jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+    """Return the distance of points to segments; a segment may be a point."""
+    axis = end - start
+    square = jnp.sum(axis * axis, axis=-1)
+    fraction = jnp.sum((point - start) * axis, axis=-1) / jnp.where(square > 0, square, 1.0)
+    return safe_norm(point - start - jnp.clip(fraction, 0.0, 1.0)[..., None] * axis)

@@ -1,4 +1,4 @@
-"""The step that is differentiated at the solver's solution: MJX's own forward, C MuJoCo's derivative backward."""
+"""The implicitly differentiated step: its values equal those of MJX, its derivatives those of C MuJoCo."""
 
 import re
 
@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from derivatives import FAST_COMPILE, assert_derivatives_agree
 from mujoco import mjx
-from slopes import QUICKLY_COMPILED, assert_three_ways_agree
 
 from lgmdjax.body import hexapod, implicit_step
 from lgmdjax.errors import InputError
@@ -23,74 +23,74 @@ def model():
 
 @pytest.fixture(scope="module")
 def targets():
-    """Set points that stray from the stance at random: feet slip, come off the floor and meet it again."""
-    strays = 0.03 * np.random.default_rng(0).normal(size=(STEPS, 6, 3)).cumsum(axis=0)
-    return jnp.asarray(hexapod.stance() + strays)
+    """Sample set points that deviate from the stance at random: feet slip, leave the floor and touch it again."""
+    deviations = 0.03 * np.random.default_rng(0).normal(size=(STEPS, 6, 3)).cumsum(axis=0)
+    return jnp.asarray(hexapod.stance() + deviations)
 
 
-def walked(model, targets, step=implicit_step.step):
-    """Stand a robot on the floor and step; what all steps leave behind."""
+def simulate(model, targets, step=implicit_step.step):
+    """Simulate a robot from its stance; return positions, velocities, accelerations and forces of all steps."""
 
-    def forward(data, wanted):
+    def forward(data, target):
         with jax.numpy_dtype_promotion("standard"):
-            data = step(model, data.replace(ctrl=wanted.reshape(18).astype(data.ctrl.dtype)))
+            data = step(model, data.replace(ctrl=target.reshape(18).astype(data.ctrl.dtype)))
         return data, (data.qpos, data.qvel, data.qacc, data.qfrc_constraint, data._impl.efc_force)
 
-    return jax.lax.scan(forward, hexapod.reset(model, jnp.zeros(3)), targets)[1]
+    return jax.lax.scan(forward, hexapod.init(model, jnp.zeros(3)), targets)[1]
 
 
 @pytest.mark.usefixtures("float32")
-def test_walks_as_the_stock_solver_to_the_last_bit(targets):
-    """In single precision, as users walk."""
-    model, wanted = hexapod.build(), jnp.asarray(targets, dtype=float)
+def test_equals_mjx_to_the_last_bit(targets):
+    """In single precision, JAX's default."""
+    model, targets = hexapod.build(), jnp.asarray(targets, dtype=float)
     ours, theirs = (
-        jax.jit(lambda wanted, step=step: walked(model, wanted, step))(wanted)
+        jax.jit(lambda targets, step=step: simulate(model, targets, step))(targets)
         for step in (implicit_step.step, mjx.step)
     )
-    assert np.abs(theirs[1]).max() > 1  # it does move
+    assert np.abs(theirs[1]).max() > 1  # the robot moves
     assert np.any(theirs[4][:, -1] != theirs[4][0, -1])
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
 @pytest.mark.slow
-def test_25_steps_on_soft_contacts_have_one_derivative_by_three_routes(model, targets):
-    """That of acceleration and forces, too, which are the solver's own."""
-    model = hexapod.softened(model)
+def test_derivatives_of_25_steps_with_soft_contacts_agree(model, targets):
+    """Those of acceleration and forces too, whose values are the solver's own."""
+    model = hexapod.soften_contacts(model)
 
-    def told(wanted):
-        return sum(jnp.sum(jnp.cos(rows)) for rows in walked(model, wanted)[:4])
+    def loss(targets):
+        return sum(jnp.sum(jnp.cos(rows)) for rows in simulate(model, targets)[:4])
 
-    assert_three_ways_agree(told, targets, step=1e-7, rtol=1e-5)
+    assert_derivatives_agree(loss, targets, step=1e-7, rtol=1e-5)
 
 
-def test_one_step_has_the_derivative_that_c_mujoco_finds_by_differences(model, targets):
-    """Of the velocity after a step by the set points, feet on the floor and slipping: `mjd_transitionFD`."""
+def test_derivative_of_one_step_equals_c_mujocos_finite_difference(model, targets):
+    """Of the velocity after a step with respect to the set points, with slipping feet (`mjd_transitionFD`)."""
     body = hexapod.load()
     body.opt.iterations, body.opt.tolerance = 100, 1e-12
-    there = mujoco.MjData(body)
-    mujoco.mj_resetDataKeyframe(body, there, body.key("stance").id)
-    for wanted in targets[:10]:
-        there.ctrl[:] = np.asarray(wanted).ravel()
-        mujoco.mj_step(body, there)
-    assert there.ncon >= 3
+    data_c = mujoco.MjData(body)
+    mujoco.mj_resetDataKeyframe(body, data_c, body.key("stance").id)
+    for target in targets[:10]:
+        data_c.ctrl[:] = np.asarray(target).ravel()
+        mujoco.mj_step(body, data_c)
+    assert data_c.ncon >= 3
     by_control = np.zeros((2 * body.nv, body.nu))
-    mujoco.mjd_transitionFD(body, there, 1e-6, True, None, by_control, None, None)
+    mujoco.mjd_transitionFD(body, data_c, 1e-6, True, None, by_control, None, None)
 
-    here = hexapod.reset(model, jnp.zeros(3))
-    here = here.replace(qpos=jnp.asarray(there.qpos), qvel=jnp.asarray(there.qvel))
+    data = hexapod.init(model, jnp.zeros(3))
+    data = data.replace(qpos=jnp.asarray(data_c.qpos), qvel=jnp.asarray(data_c.qvel))
 
-    def velocity(wanted):
-        return hexapod.substep(model, here, wanted).qvel
+    def velocity(targets):
+        return hexapod.substep(model, data, targets).qvel
 
-    ours = jax.jit(jax.jacrev(velocity), compiler_options=QUICKLY_COMPILED)(jnp.asarray(there.ctrl).reshape(6, 3))
+    ours = jax.jit(jax.jacrev(velocity), compiler_options=FAST_COMPILE)(jnp.asarray(data_c.ctrl).reshape(6, 3))
     theirs = by_control[body.nv :]
     assert np.abs(theirs).max() > 0.1
     np.testing.assert_allclose(ours.reshape(theirs.shape), theirs, rtol=1e-4, atol=1e-5 * np.abs(theirs).max())
 
 
-def test_a_version_or_an_integrator_that_it_does_not_know_is_refused(model, monkeypatch):
+def test_unsupported_versions_and_integrators_are_rejected(model, monkeypatch):
     with pytest.raises(InputError, match=re.escape('integrator="Euler", got RK4')):
-        implicit_step.check(model.replace(opt=model.opt.replace(integrator=mjx.IntegratorType.RK4)))
+        implicit_step.check_supported(model.replace(opt=model.opt.replace(integrator=mjx.IntegratorType.RK4)))
     monkeypatch.setattr(implicit_step, "version", lambda package: "3.99.1")
     with pytest.raises(InputError, match=re.escape("expected mujoco-mjx 3.17, whose solver")):
-        jax.eval_shape(implicit_step.step, model, hexapod.reset(model, jnp.zeros(3)))
+        jax.eval_shape(implicit_step.step, model, hexapod.init(model, jnp.zeros(3)))

@@ -1,4 +1,4 @@
-"""The doctor finds nothing wrong here, and says so in one line when something is."""
+"""`lgmdjax doctor`: nothing is wrong here, and each fault is reported in one line."""
 
 import sys
 from pathlib import Path
@@ -12,30 +12,30 @@ from lgmdjax.cli import doctor, main
 from lgmdjax.errors import InputError
 
 
-def test_this_machine_is_well(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = doctor.examine(tmp_path)
+def test_no_check_fails_on_this_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = doctor.run_checks(tmp_path)
     lines = capsys.readouterr().out.splitlines()
     assert code == 0, lines
     assert len(lines) == 8
     assert all(line.startswith(("OK ", "WARN")) for line in lines)
 
 
-def test_this_jax_computes_the_canary_right() -> None:
+def test_jax_computes_the_canary_program_correctly() -> None:
     assert doctor.arithmetic().level == doctor.OK
 
 
-def test_a_miscompiled_program_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    def forgets_rows(function: object) -> object:
+def test_a_miscompiled_program_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def skip_rows(function: object) -> object:
         return lambda rows: np.where(np.arange(len(rows)) % 2, np.sum(rows**2, axis=1), 0.0)
 
-    monkeypatch.setattr(jax, "jit", forgets_rows)
-    found = doctor.arithmetic()
-    assert found.level == doctor.FAIL
-    assert "16385 of 32769 results wrong" in found.text
+    monkeypatch.setattr(jax, "jit", skip_rows)
+    finding = doctor.arithmetic()
+    assert finding.level == doctor.FAIL
+    assert "16385 of 32769 results wrong" in finding.text
 
 
 @pytest.mark.parametrize(
-    ("wanted", "level", "words"),
+    ("required", "level", "words"),
     [
         (["jax>=0.9.2,!=0.10.*", "numpy>=1"], doctor.OK, "jax 0."),
         (["jax>=99"], doctor.FAIL, "expected >=99"),
@@ -43,53 +43,53 @@ def test_a_miscompiled_program_is_found(monkeypatch: pytest.MonkeyPatch) -> None
         (["no-such-package>=1; extra == 'gym'"], doctor.OK, ""),
     ],
 )
-def test_versions_out_of_range_are_found(
-    monkeypatch: pytest.MonkeyPatch, wanted: list[str], level: str, words: str
+def test_versions_out_of_range_are_reported(
+    monkeypatch: pytest.MonkeyPatch, required: list[str], level: str, words: str
 ) -> None:
-    monkeypatch.setattr(doctor, "requires", lambda name: wanted)
-    found = doctor.packages()
-    assert found.level == level
-    assert words in found.text
+    monkeypatch.setattr(doctor, "requires", lambda name: required)
+    finding = doctor.packages()
+    assert finding.level == level
+    assert words in finding.text
 
 
-def test_unequal_versions_of_mujoco_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_different_versions_of_mujoco_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "requires", lambda name: [])
     monkeypatch.setattr(doctor, "version", lambda name: {"mujoco": "3.18.0"}.get(name, "3.17.0"))
     assert doctor.packages().level == doctor.FAIL
 
 
-def test_a_failing_check_is_a_line_and_an_exit_code(
+def test_a_failing_check_is_one_line_and_exit_code_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def lost() -> None:
+    def fail() -> None:
         raise InputError("expected the robot,\ngot nothing")
 
-    monkeypatch.setattr(hexapod, "load", lost)
-    assert doctor.examine(tmp_path) == 1
+    monkeypatch.setattr(hexapod, "load", fail)
+    assert doctor.run_checks(tmp_path) == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith("FAIL")] == [
         "FAIL  physics     InputError: expected the robot, got nothing"
     ]
 
 
-def test_physics_that_cannot_be_imported_are_a_line(
+def test_physics_that_cannot_be_imported_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "mujoco.mjx", None)
+    monkeypatch.setitem(sys.modules, "lgmdjax.runtime.mjx", None)
     assert main.main(["doctor", "--out", str(tmp_path)]) == 1
     assert "FAIL  physics     ModuleNotFoundError" in capsys.readouterr().out
 
 
-def test_a_folder_that_cannot_be_written_is_found(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert doctor.folder(tmp_path / "not yet" / "there").level == doctor.OK
+    assert doctor.folder(tmp_path / "new" / "folder").level == doctor.OK
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
-    for place in (tmp_path / "file", tmp_path / "file" / "inside", Path("/proc/nowhere")):
-        assert doctor.folder(place).level == doctor.FAIL
+    for path in (tmp_path / "file", tmp_path / "file" / "inside", Path("/proc/nowhere")):
+        assert doctor.folder(path).level == doctor.FAIL
 
 
-def test_a_full_disk_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for enough, least, level in ((0.0, 0.0, doctor.OK), (1e9, 0.0, doctor.WARN), (1e9, 1e9, doctor.FAIL)):
+def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for enough, minimum, level in ((0.0, 0.0, doctor.OK), (1e9, 0.0, doctor.WARN), (1e9, 1e9, doctor.FAIL)):
         monkeypatch.setattr(doctor, "ENOUGH_GB", enough)
-        monkeypatch.setattr(doctor, "LEAST_GB", least)
+        monkeypatch.setattr(doctor, "MIN_GB", minimum)
         assert doctor.disk(tmp_path).level == level

@@ -1,4 +1,4 @@
-"""The detectors on a video: a disc on the right excites the right eye; bad videos leave nothing."""
+"""`lgmdjax watch`: a disc that looms on the right excites the right eye; a bad video leaves no files."""
 
 import json
 from pathlib import Path
@@ -12,38 +12,38 @@ import pyarrow.parquet
 import pytest
 
 from lgmdjax.cli import main
-from lgmdjax.cli.watch import Eyes, watch
+from lgmdjax.cli.watch import StereoLayout, detect_looming
 from lgmdjax.detectors import lgmd
 from lgmdjax.reporting import lgmd_overlay, video_io
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 40
 
 
-def ground() -> np.ndarray:
-    """Coarse noise, always the same."""
+def background() -> np.ndarray:
+    """Return a picture of coarse noise, always the same."""
     coarse = np.random.default_rng(0).integers(100, 180, (HEIGHT // 8, WIDTH // 8), np.uint8)
     return coarse.repeat(8, axis=0).repeat(8, axis=1)
 
 
 def looming(x: float, frames: int = FRAMES) -> np.ndarray:
-    """A dark disc that comes at constant speed towards column x (-1: none comes); (frame, row, column)."""
+    """Return frames of a dark disc that approaches column x at constant speed (-1: no disc); (frame, row, column)."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     grey = []
     for distance in np.linspace(3, 0.3, FRAMES)[:frames]:
-        cover = np.clip(6 / distance - np.hypot(columns - x, rows - HEIGHT / 2) + 0.5, 0, 1) * (x >= 0)
-        grey.append(ground() * (1 - cover) + 30 * cover)
+        coverage = np.clip(6 / distance - np.hypot(columns - x, rows - HEIGHT / 2) + 0.5, 0, 1) * (x >= 0)
+        grey.append(background() * (1 - coverage) + 30 * coverage)
     return np.asarray(grey).astype(np.uint8)
 
 
 def save(path: Path, frames: np.ndarray, rate: int = 30) -> Path:
-    with video_io.writing(path, frames.shape[2], frames.shape[1], rate) as write:
+    with video_io.open_writer(path, frames.shape[2], frames.shape[1], rate) as write:
         for grey in frames:
             write(grey[..., None].repeat(3, axis=-1))
     return path
 
 
 def run(path: Path, *flags: str) -> pa.Table:
-    """Watch a video from the command line; give the table."""
+    """Run `lgmdjax watch` on a video, and return the table of responses."""
     assert main.main(["watch", str(path), "--out", str(path.parent / "out"), *flags]) == 0
     folder = path.parent / "out" / path.name
     assert sorted(file.suffix for file in folder.iterdir()) == sorted([".mp4", ".png", _suffix(flags)])
@@ -55,8 +55,8 @@ def _suffix(flags: tuple[str, ...]) -> str:
     return ".parquet" if "parquet" in flags else ".csv"
 
 
-def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """The lines on stderr, progress bars aside."""
+def stderr_lines(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Return the lines on stderr, without those of progress bars."""
     return [line for line in capsys.readouterr().err.splitlines() if line and not line.startswith("watch:")]
 
 
@@ -76,13 +76,13 @@ def test_a_disc_on_the_right_excites_the_right_eye(tmp_path: Path) -> None:
     assert column(table, "feed_forward_right")[-1] > 1
 
 
-def test_the_numbers_are_those_of_the_detector(tmp_path: Path) -> None:
-    """The same frames shown to lgmd.step one by one, as the video gives them back."""
+def test_responses_equal_those_of_the_detector(tmp_path: Path) -> None:
+    """`lgmd.step` gives the same u for the frames that are decoded from the video."""
     path = save(tmp_path / "disc.mp4", looming(40))
     table = run(path, "--mono", "--overlap", "0.75", "--threshold", "3", "--table", "parquet")
     params = lgmd.Params(threshold=3.0)
-    with video_io.reading(path) as film:
-        frames = [frame.picture.astype(float) for frame in film.frames(WIDTH, HEIGHT)]
+    with video_io.open_reader(path) as video:
+        frames = [frame.picture.astype(float) for frame in video.frames(WIDTH, HEIGHT)]
     for name, columns in (("left", slice(0, 72)), ("right", slice(24, 96))):
         state, u = lgmd.init(params, jnp.asarray(frames[0][:, columns])), []
         for frame in frames:
@@ -96,7 +96,7 @@ def test_the_numbers_are_those_of_the_detector(tmp_path: Path) -> None:
 
 
 def test_stereo_gives_each_eye_its_own_picture(tmp_path: Path) -> None:
-    """The disc stands in the right picture only, on that picture's right."""
+    """The disc is in the right picture only, on its right side."""
     pair = np.concatenate([looming(-1), looming(72)], axis=2)
     table = run(save(tmp_path / "pair.mp4", pair), "--stereo", "side-by-side")
     assert column(table, "u_right")[-1] > 0.9
@@ -113,25 +113,25 @@ def test_large_videos_are_averaged_down(tmp_path: Path) -> None:
     assert np.allclose(column(large, "u_right"), column(small, "u_right"), atol=0.1)
 
 
-def test_the_overlay_shows_every_frame_and_where_the_cells_fire(tmp_path: Path) -> None:
+def test_the_overlay_shows_every_frame_and_marks_the_cells_above_threshold(tmp_path: Path) -> None:
     run(save(tmp_path / "disc.mp4", looming(72)), "--mono")
     with av.open(str(tmp_path / "out" / "disc.mp4" / "overlay.mp4")) as container:
         assert container.streams.video[0].codec_context.name in ("h264", "libx264")
         frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
     assert len(frames) == FRAMES
-    sheet = lgmd_overlay.lay_out(HEIGHT, WIDTH // 2)
-    height, width = HEIGHT * sheet.scale, WIDTH // 2 * sheet.scale
-    for name, orange_expected in zip(lgmd_overlay.NAMES, (True, False, False, True), strict=True):
-        top, left = sheet.corners[lgmd_overlay.NAMES.index(name)]
-        for side, fires in ((0, False), (1, True)):
+    overlay = lgmd_overlay.make_layout(HEIGHT, WIDTH // 2)
+    height, width = HEIGHT * overlay.scale, WIDTH // 2 * overlay.scale
+    for name, orange_expected in zip(lgmd_overlay.PANEL_TITLES, (True, False, False, True), strict=True):
+        top, left = overlay.panel_corners[lgmd_overlay.PANEL_TITLES.index(name)]
+        for side, is_excited in ((0, False), (1, True)):
             x = left + side * (width + lgmd_overlay.GAP)
             panel = frames[-1][top : top + height, x : x + width]
             orange = np.mean(panel[..., 0] - panel[..., 2] > 60)
-            assert (orange > 0.005) == (orange_expected and fires), (name, side, orange)
+            assert (orange > 0.005) == (orange_expected and is_excited), (name, side, orange)
 
 
 @pytest.mark.parametrize(
-    ("made", "flags", "words"),
+    ("kind", "flags", "words"),
     [
         ("missing", (), "found no file"),
         ("text", (), "expected a video"),
@@ -146,20 +146,20 @@ def test_the_overlay_shows_every_frame_and_where_the_cells_fire(tmp_path: Path) 
         ("good", ("--width", "-8"), "16 px or more"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(
-    tmp_path: Path, made: str, flags: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+def test_bad_input_is_one_line_and_leaves_no_files(
+    tmp_path: Path, kind: str, flags: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "video.mp4"
-    if made == "text":
+    if kind == "text":
         path.write_text("no video")
-    elif made == "odd":
+    elif kind == "odd":
         with av.open(str(path), "w") as container:
             stream = container.add_stream("mpeg4", rate=30)
             assert isinstance(stream, av.VideoStream)
             stream.width, stream.height, stream.pix_fmt = WIDTH + 1, HEIGHT, "yuv420p"
             container.mux(stream.encode(av.VideoFrame(WIDTH + 1, HEIGHT, "yuv420p")))
             container.mux(stream.encode())
-    elif made == "truncated":
+    elif kind == "truncated":
         path = tmp_path / "video.mkv"
         with av.open(str(path), "w") as container:
             stream = container.add_stream("mpeg4", rate=30)
@@ -169,16 +169,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(grey, format="gray")))
             container.mux(stream.encode())
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    elif made != "missing":
-        save(path, looming(72, 2 if made == "short" else FRAMES))
+    elif kind != "missing":
+        save(path, looming(72, 2 if kind == "short" else FRAMES))
     code = main.main(["watch", str(path), "--out", str(tmp_path / "out"), *flags])
-    lines = said(capsys)
+    lines = stderr_lines(capsys)
     assert code == 2
     assert len(lines) == 1 and lines[0].startswith("lgmdjax: ") and words in lines[0], lines
     assert not any(file.is_file() for file in (tmp_path / "out").rglob("*"))
 
 
-def test_a_failure_keeps_the_results_of_an_earlier_time(tmp_path: Path) -> None:
+def test_a_failure_keeps_the_files_of_an_earlier_call(tmp_path: Path) -> None:
     path = save(tmp_path / "disc.mp4", looming(72))
     run(path)
     before = {file.name: file.read_bytes() for file in (tmp_path / "out" / "disc.mp4").iterdir()}
@@ -187,8 +187,8 @@ def test_a_failure_keeps_the_results_of_an_earlier_time(tmp_path: Path) -> None:
     assert {file.name: file.read_bytes() for file in (tmp_path / "out" / "disc.mp4").iterdir()} == before
 
 
-def test_each_video_has_its_folder_and_the_folder_one_table(tmp_path: Path) -> None:
-    """`run` looks at what a folder holds: a table of one kind, the one asked for last."""
+def test_each_video_has_a_folder_with_one_table(tmp_path: Path) -> None:
+    """`run` checks the files of a folder: the table has the format of the last call."""
     first = save(tmp_path / "disc.mp4", looming(72))
     second = tmp_path / "disc.mkv"
     second.write_bytes(first.read_bytes())
@@ -202,10 +202,10 @@ def test_each_video_has_its_folder_and_the_folder_one_table(tmp_path: Path) -> N
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save(tmp_path / "disc.mp4", looming(72))
     assert main.main(["watch", str(path), "--out", str(path)]) == 2
-    assert len(lines := said(capsys)) == 1 and "can be written" in lines[0]
+    assert len(lines := stderr_lines(capsys)) == 1 and "can be written" in lines[0]
 
 
-def test_an_unusual_rate_is_pointed_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unusual_frame_rate_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save(tmp_path / "fast.mp4", looming(72), rate=120)
-    watch(path, tmp_path / "out", eyes=Eyes(), params=lgmd.Params())
+    detect_looming(path, tmp_path / "out", layout=StereoLayout(), params=lgmd.Params())
     assert "120 frames a second" in capsys.readouterr().out

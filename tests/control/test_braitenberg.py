@@ -1,4 +1,4 @@
-"""The vehicles as printed, and a teacher that keeps to the gait and does not walk into a wall."""
+"""Vehicles and eq. 22 as printed, and a teacher that stays in the range of the gait and turns in front of a wall."""
 
 from dataclasses import replace
 
@@ -17,11 +17,11 @@ PARAMS = braitenberg.Params()
 distances = st.tuples(st.floats(0.02, 5.0), st.floats(0.02, 5.0))
 step = jax.jit(braitenberg.step)
 rule = jax.jit(braitenberg.rule)
-untimed = settings(deadline=None)  # the first example compiles
+no_deadline = settings(deadline=None)  # the first example compiles
 
 
 def teach(d, side=0.0, params=PARAMS):
-    """One beat, as NumPy."""
+    """One step from a turn to `side`; the next side, and the velocity as NumPy."""
     state, velocity = step(params, braitenberg.State(side=jnp.asarray(side)), jnp.asarray(d))
     return float(state.side), np.asarray(velocity)
 
@@ -32,29 +32,29 @@ def test_vehicles_equal_the_paper(strict, name):
     np.testing.assert_allclose(getattr(braitenberg, name)(jnp.asarray([0.3, 0.9]), 1.2, 0.7), expected)
 
 
-@untimed
+@no_deadline
 @given(distances)
 def test_rule_equals_eq_22_and_never_retreats(d):
-    """The sum is 2 v_base + (k_2a - k_3b)(1/d_l + 1/d_r), which is positive: both sides never go backward."""
+    """The sum is 2 v_base + (k_2a - k_3b)(1/d_l + 1/d_r) > 0: one side always goes forward."""
     velocity = rule(PARAMS, jnp.asarray(d))
     np.testing.assert_allclose(velocity, reference.rule(*d), rtol=1e-6, atol=1e-6)
     assert max(velocity) > 0
 
 
-@untimed
+@no_deadline
 @given(distances, st.sampled_from([-1.0, 0.0, 1.0]))
-def test_teacher_keeps_to_the_range_of_the_gait(d, side):
+def test_teacher_stays_in_the_range_of_the_gait(d, side):
     after, velocity = teach(d, side)
     assert np.all(velocity >= -1 - 1e-9) and np.all(velocity <= 2 + 1e-9)
     assert after in (-1, 0, 1)
 
 
-@untimed
+@no_deadline
 @given(distances, st.sampled_from([-1.0, 0.0, 1.0]))
-def test_mirrored_world_mirrors_the_command(d, side):
-    """With the first side mirrored too, which only an exact tie before any turn needs."""
+def test_mirrored_distances_give_the_mirrored_velocity(d, side):
+    """The default side is mirrored too; only an exact tie before any turn uses it."""
     after, velocity = teach(d, side)
-    mirrored, swapped = teach(d[::-1], -side, replace(PARAMS, first_side=-1.0))
+    mirrored, swapped = teach(d[::-1], -side, replace(PARAMS, default_side=-1.0))
     np.testing.assert_allclose(swapped, velocity[::-1], atol=1e-9)
     assert mirrored == -after
 
@@ -62,7 +62,7 @@ def test_mirrored_world_mirrors_the_command(d, side):
 @settings(max_examples=200, deadline=None)
 @given(st.tuples(st.floats(-3, 5), st.floats(-3, 5)))
 def test_limit_keeps_the_turn_rather_than_the_speed(velocity):
-    """Inside the range nothing changes; outside, the turn stays as far as it goes, the speed is nearest."""
+    """Inside the range nothing changes. Outside, the turn is kept up to the widest, and the mean moves least."""
     limited = np.asarray(braitenberg.limit(PARAMS, jnp.asarray(velocity)))
     turn = velocity[1] - velocity[0]
     np.testing.assert_allclose(limited[1] - limited[0], np.clip(turn, -3, 3), atol=1e-9)
@@ -73,16 +73,16 @@ def test_limit_keeps_the_turn_rather_than_the_speed(velocity):
         assert np.isclose(limited.max(), 2) or np.isclose(limited.min(), -1)
 
 
-def test_without_tie_break_the_teacher_is_the_limited_rule():
-    plain = replace(PARAMS, full_turn=0.0, symmetry=0.0)
+def test_without_minimum_turn_and_tie_break_the_teacher_is_the_limited_rule():
+    plain = replace(PARAMS, full_turn=0.0, tie_tolerance=0.0)
     for d in ((0.4, 2.0), (1.0, 1.3), (0.3, 0.31), (5.0, 5.0)):
         expected = braitenberg.limit(PARAMS, rule(PARAMS, jnp.asarray(d)))
         np.testing.assert_allclose(teach(d, -1.0, plain)[1], expected, atol=1e-9)
 
 
-@untimed
+@no_deadline
 @given(st.tuples(st.floats(0.95, 5.0), st.floats(0.95, 5.0)))
-def test_far_from_everything_the_teacher_is_eq_22(d):
+def test_far_from_obstacles_the_teacher_is_eq_22(d):
     expected = braitenberg.limit(PARAMS, rule(PARAMS, jnp.asarray(d)))
     np.testing.assert_allclose(teach(d, 1.0)[1], expected, atol=1e-9)
 
@@ -91,13 +91,13 @@ def test_turns_away_from_the_nearer_side_and_harder_the_nearer_it_is():
     turns = []
     for d in (2.0, 1.2, 0.8, 0.5):
         _, (left, right) = teach((5.0, d))
-        assert right > left, "an obstacle on the right is left to the right"
+        assert right > left, "it turns left, away from an obstacle on the right"
         turns.append(right - left)
     assert turns == sorted(turns)
 
 
-def test_in_front_of_a_wall_it_turns_and_goes_on_turning():
-    """Both sides equally near: eq. 22 alone speeds up; the teacher turns hard, the same way each time."""
+def test_in_front_of_a_wall_it_turns_and_keeps_its_direction():
+    """With both sides equally near eq. 22 accelerates; the teacher turns hard, always in the same direction."""
     raw = np.asarray(rule(PARAMS, jnp.asarray([0.4, 0.4])))
     assert raw[0] == raw[1] > 1.2
     for side in (1.0, -1.0):
@@ -106,33 +106,33 @@ def test_in_front_of_a_wall_it_turns_and_goes_on_turning():
             assert after == side
             assert (right - left) * side >= 2
     after, (left, right) = teach((0.4, 0.4))
-    assert after == PARAMS.first_side and right > left
+    assert after == PARAMS.default_side and right > left
 
 
-def test_a_tie_is_broken_by_the_turn_under_way():
-    """Whoever drives: watched to the right it goes on to the right, though the left is a little farther."""
-    for driven, side in (([2.0, -1.0], -1), ([-1.0, 2.0], 1), ([1.2, 1.3], 0)):
-        assert braitenberg.watch(PARAMS, jnp.asarray(driven)).side == side
-    _, velocity = step(PARAMS, braitenberg.watch(PARAMS, jnp.asarray([2.0, 0.5])), jnp.asarray([0.42, 0.4]))
+def test_a_tie_is_broken_by_the_present_turn():
+    """After a right turn of any policy it turns right again, although the left side is slightly farther away."""
+    for velocity, side in (([2.0, -1.0], -1), ([-1.0, 2.0], 1), ([1.2, 1.3], 0)):
+        assert braitenberg.track_turn(PARAMS, jnp.asarray(velocity)).side == side
+    _, velocity = step(PARAMS, braitenberg.track_turn(PARAMS, jnp.asarray([2.0, 0.5])), jnp.asarray([0.42, 0.4]))
     assert velocity[0] - velocity[1] > 2
 
 
-def test_a_clearly_nearer_side_turns_it_round():
+def test_a_clearly_nearer_side_reverses_the_turn():
     after, (left, right) = teach((0.4, 0.9), side=1.0)
     assert after == -1 and left - right >= 2
 
 
-def test_open_space_decides_no_side():
-    """Else a robot and its mirror image would have turned the same way before they see anything."""
+def test_far_from_obstacles_no_side_is_chosen():
+    """Otherwise a robot and its mirror image would turn to the same side before they meet an obstacle."""
     assert teach((5.0, 5.0))[0] == 0
     np.testing.assert_allclose(teach((5.0, 5.0))[1], 1.2 + 0.2 / 5, rtol=1e-6)
 
 
-def test_gradients_are_finite_even_at_no_distance(precision, strict):
-    def told(params, d):
+def test_gradients_are_finite_even_at_distance_zero(precision, strict):
+    def velocity_sum(params, d):
         return braitenberg.step(params, braitenberg.init(params), d)[1].sum()
 
-    gradient = jax.jit(jax.grad(told, argnums=(0, 1)))
+    gradient = jax.jit(jax.grad(velocity_sum, argnums=(0, 1)))
     for d in ([0.0, 0.0], [0.7, 0.7], [0.7, 0.9], [5.0, 5.0]):
         gradients = gradient(PARAMS, jnp.asarray(d))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
@@ -143,12 +143,12 @@ def test_gradients_are_finite_even_at_no_distance(precision, strict):
     [
         {"base": float("nan")},
         {"gain_2a": -0.1},
-        {"slowest": 2.5},
-        {"close": 1.5},
-        {"first_side": 0.0},
+        {"min_velocity": 2.5},
+        {"full_turn_distance": 1.5},
+        {"default_side": 0.0},
     ],
 )
-def test_numbers_that_make_no_sense_are_refused(wrong):
+def test_invalid_numbers_are_refused(wrong):
     braitenberg.check(PARAMS)
     with pytest.raises(InputError, match=f"braitenberg {next(iter(wrong))}: expected"):
         braitenberg.check(replace(PARAMS, **wrong))

@@ -1,6 +1,7 @@
-"""One eye: the paper's equations cell by cell, what it should and should not fire at, bad pictures."""
+"""The LGMD of one eye: the paper's equations cell by cell, its selectivity, gradients, refused input."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +12,14 @@ from scipy import ndimage
 
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
-from lgmdjax.sensors import hemifield
 
 HEIGHT, WIDTH = 60, 80
 
 
 @jax.jit
-def watch(params, frames):
-    """Show a film; the response has one entry a frame after the first."""
-    show = lambda state, frame: lgmd.step(params, state, frame)  # noqa: E731
-    return jax.lax.scan(show, lgmd.init(params, frames[0]), frames[1:])[1]
+def respond(params, frames):
+    """Return the responses to all frames after the first."""
+    return jax.lax.scan(partial(lgmd.step, params), lgmd.init(params, frames[0]), frames[1:])[1]
 
 
 def noise(frames, height, width, seed=0):
@@ -28,56 +27,56 @@ def noise(frames, height, width, seed=0):
 
 
 def disc(radius, x=WIDTH / 2, y=HEIGHT / 2):
-    """Draw a dark disc on a bright ground, its edge one pixel wide, as a camera would."""
+    """Return the image of a dark disc on a bright ground, with an edge one pixel wide."""
     row, column = np.mgrid[:HEIGHT, :WIDTH]
-    cover = np.clip(radius - np.hypot(column - x, row - y) + 0.5, 0, 1)
-    return 200 - 160 * cover
+    coverage = np.clip(radius - np.hypot(column - x, row - y) + 0.5, 0, 1)
+    return 200 - 160 * coverage
 
 
 def approach(frames=90):
-    """A disc that comes at constant speed: its radius grows as 1 / distance."""
+    """Return the images of a disc that approaches at constant speed: its radius grows as 1 / distance."""
     return jnp.asarray(np.stack([disc(10 / d) for d in np.linspace(3, 0.42, frames)]))
 
 
 def assert_equals_reference(frames, **printed):
-    """Compare a film's u, FF and U with the transcription; T_f = 30 lies between loud and quiet noise."""
+    """Compare u, FF and U with the transcription; T_f = 30 lies between strong and weak noise."""
     expected = reference.lgmd(frames, 12.0, 30.0, **printed)
     params = lgmd.Params(threshold=12.0, suppression=30.0, **printed)
-    response = watch(params, jnp.asarray(frames, dtype=float))
+    response = respond(params, jnp.asarray(frames, dtype=float))
     for name in ("u", "feed_forward", "excitation"):
         values = [cells[name] for cells in expected]
         np.testing.assert_allclose(getattr(response, name), values, rtol=1e-4, atol=1e-4)
 
 
 def test_equals_the_paper_cell_by_cell(precision, strict):
-    """Loud and quiet noise, which T_f tells apart; a film that is lower than the kernel."""
+    """For strong and weak noise, between which T_f lies, and for frames with fewer rows than the kernel."""
     assert_equals_reference(np.concatenate([noise(4, 13, 17), 0.2 * noise(4, 13, 17)]))
     assert_equals_reference(0.3 * noise(4, 4, 9))
 
 
-def test_a_pooled_detector_is_that_of_a_coarser_picture(precision, strict):
-    """Blocks of 3 x 3 pixels averaged by hand, then the paper's equations."""
+def test_pooling_equals_a_coarser_image(precision, strict):
+    """Blocks of 3 x 3 pixels are averaged in NumPy, then the paper's equations apply."""
     frames = 0.1 * noise(6, 27, 36)
     blocks = frames.reshape(6, 9, 3, 12, 3).mean(axis=(2, 4))
     expected = reference.lgmd(blocks, 2.0, 30.0)
-    response = watch(lgmd.Params(threshold=2.0, suppression=30.0, pooling=3), jnp.asarray(frames, dtype=float))
+    response = respond(lgmd.Params(threshold=2.0, suppression=30.0, pooling=3), jnp.asarray(frames, dtype=float))
     np.testing.assert_allclose(response.u, [cells["u"] for cells in expected], rtol=1e-4, atol=1e-4)
     assert np.ptp(response.u) > 0.01
 
 
-def test_pooling_shares_a_picture_evenly_and_keeps_its_mirror_image():
-    """Ten pixels among three cells: the middle one gets two thirds of the fourth and of the seventh."""
-    picture = jnp.asarray(noise(1, 10, 10)[0])
-    cells = lgmd.pool(lgmd.Params(pooling=3), picture)
-    share = np.zeros((3, 10))
-    share[0, :4], share[1, 3:7], share[2, 6:] = (1, 1, 1, 1 / 3), (2 / 3, 1, 1, 2 / 3), (1 / 3, 1, 1, 1)
-    np.testing.assert_allclose(cells, 0.3 * share @ picture @ (0.3 * share).T, rtol=1e-12)
-    np.testing.assert_allclose(lgmd.pool(lgmd.Params(pooling=3), picture[:, ::-1]), cells[:, ::-1], rtol=1e-12)
-    np.testing.assert_allclose(cells.mean(), picture.mean(), rtol=1e-12)
+def test_pooling_divides_an_image_evenly_and_keeps_mirror_symmetry():
+    """Ten pixels for three cells: the middle one has two thirds of the fourth and of the seventh pixel."""
+    image = jnp.asarray(noise(1, 10, 10)[0])
+    cells = lgmd.pool(lgmd.Params(pooling=3), image)
+    weights = np.zeros((3, 10))
+    weights[0, :4], weights[1, 3:7], weights[2, 6:] = (1, 1, 1, 1 / 3), (2 / 3, 1, 1, 2 / 3), (1 / 3, 1, 1, 1)
+    np.testing.assert_allclose(cells, 0.3 * weights @ image @ (0.3 * weights).T, rtol=1e-12)
+    np.testing.assert_allclose(lgmd.pool(lgmd.Params(pooling=3), image[:, ::-1]), cells[:, ::-1], rtol=1e-12)
+    np.testing.assert_allclose(cells.mean(), image.mean(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("printed", [{"printed_feed_forward": True}, {"printed_gate": True}])
-def test_equals_the_printed_equations_on_request(printed):
+def test_equals_the_printed_equations_on_demand(printed):
     assert_equals_reference(np.concatenate([noise(4, 13, 17), 0.2 * noise(4, 13, 17)]), **printed)
 
 
@@ -93,68 +92,68 @@ def test_layers_equal_the_paper_cell_by_cell(precision):
 def test_inhibition_is_a_correlation_with_any_symmetric_kernel():
     kernel = np.random.default_rng(1).uniform(0, 1, (5, 5))
     kernel = sum((kernel, kernel[::-1], kernel[:, ::-1], kernel[::-1, ::-1])) / 4
-    picture = noise(1, 30, 41)[0]
-    expected = ndimage.correlate(picture, kernel, mode="constant")
-    np.testing.assert_allclose(lgmd.inhibit(jnp.asarray(kernel), jnp.asarray(picture)), expected, rtol=1e-10)
+    image = noise(1, 30, 41)[0]
+    expected = ndimage.correlate(image, kernel, mode="constant")
+    np.testing.assert_allclose(lgmd.inhibit(jnp.asarray(kernel), jnp.asarray(image)), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("smooth", [False, True])
-def test_a_still_picture_leaves_the_cell_at_rest(precision, smooth):
+def test_a_static_image_gives_the_resting_response(precision, smooth):
     frames = jnp.asarray(np.tile(noise(1, HEIGHT, WIDTH), (4, 1, 1)), dtype=float)
-    response = watch(lgmd.Params(smooth=smooth), frames)
+    response = respond(lgmd.Params(smooth=smooth), frames)
     np.testing.assert_array_equal(response.u, 0.5)
     np.testing.assert_array_equal(response.excitation, 0.0)
 
 
-def test_fires_harder_the_nearer_the_disc_is():
-    u = watch(lgmd.Params(threshold=8.0), approach()).u
-    thirds = u[-60:].reshape(6, 10).mean(axis=1)  # of a second
-    assert np.all(np.diff(thirds) > 0), thirds
+def test_response_increases_during_an_approach():
+    u = respond(lgmd.Params(threshold=8.0), approach()).u
+    means = u[-60:].reshape(6, 10).mean(axis=1)  # over a third of a second each
+    assert np.all(np.diff(means) > 0), means
     assert u[-1] > 0.9
     assert u[5:20].max() < 0.6
 
 
 def test_approach_beats_recession():
-    """The same pictures backward: at equal sizes of the disc, and in all, the cell fires less."""
-    film, params = approach(), lgmd.Params(threshold=8.0, suppression=1e9)
-    coming = watch(params, film).excitation[2:-2]
-    leaving = watch(params, film[::-1]).excitation[::-1][2:-2]
-    assert coming.sum() > 1.05 * leaving.sum()
-    assert np.all((coming - leaving)[-40:].reshape(8, 5).mean(axis=1) > 0)
+    """The same images in reverse excite less, at equal sizes of the disc and in the sum."""
+    frames, params = approach(), lgmd.Params(threshold=8.0, suppression=1e9)
+    approaching = respond(params, frames).excitation[2:-2]
+    receding = respond(params, frames[::-1]).excitation[::-1][2:-2]
+    assert approaching.sum() > 1.05 * receding.sum()
+    assert np.all((approaching - receding)[-40:].reshape(8, 5).mean(axis=1) > 0)
 
 
 def test_approach_beats_translation():
-    """A disc of the same size whose edge sweeps sideways as fast as the other's grows."""
-    film, params = approach(), lgmd.Params(threshold=8.0, suppression=1e9)
+    """The other disc has the same size and moves sideways as fast as the radius of the approaching one grows."""
+    frames, params = approach(), lgmd.Params(threshold=8.0, suppression=1e9)
     radius = 10 / np.linspace(3, 0.42, 90)
-    coming = watch(params, film).excitation
+    approaching = respond(params, frames).excitation
     for k in (60, 70, 80):
         speed = radius[k] - radius[k - 1]
-        passing = np.stack([disc(radius[k], x=WIDTH / 2 + speed * (i - 4)) for i in range(5)])
-        assert coming[k - 1] > 1.2 * watch(params, jnp.asarray(passing)).excitation[-1]
+        translating = np.stack([disc(radius[k], x=WIDTH / 2 + speed * (i - 4)) for i in range(5)])
+        assert approaching[k - 1] > 1.2 * respond(params, jnp.asarray(translating)).excitation[-1]
 
 
-def test_a_fast_turn_silences_the_cell_and_the_printed_equations_do_not_see_it():
-    """A textured panorama swings by 6 pixels a frame."""
+def test_a_fast_turn_suppresses_the_response_but_not_with_the_printed_equations():
+    """A textured panorama shifts by 6 pixels a frame."""
     panorama = ndimage.gaussian_filter(noise(1, HEIGHT, WIDTH + 120)[0], 1.5) * 6 % 255
     turn = jnp.asarray(np.stack([panorama[:, 6 * i : 6 * i + WIDTH] for i in range(12)]))
-    silenced = watch(lgmd.Params(suppression=20.0), turn)
-    np.testing.assert_array_equal(silenced.u[1:], 0.5)
-    assert np.all(silenced.feed_forward[1:] > 20)
-    unseen = watch(lgmd.Params(suppression=20.0, printed_feed_forward=True), turn)
-    assert np.all(np.abs(unseen.feed_forward) < 5)
-    assert np.all(unseen.u > 0.9)
-    np.testing.assert_array_equal(watch(lgmd.Params(printed_gate=True), approach()).u, 0.5)
+    suppressed = respond(lgmd.Params(suppression=20.0), turn)
+    np.testing.assert_array_equal(suppressed.u[1:], 0.5)
+    assert np.all(suppressed.feed_forward[1:] > 20)
+    printed = respond(lgmd.Params(suppression=20.0, printed_feed_forward=True), turn)
+    assert np.all(np.abs(printed.feed_forward) < 5)
+    assert np.all(printed.u > 0.9)
+    np.testing.assert_array_equal(respond(lgmd.Params(printed_gate=True), approach()).u, 0.5)
 
 
 def test_smooth_thresholds_tend_to_the_hard_ones(precision):
     frames = jnp.asarray(np.concatenate([approach(30), 40 + 0.2 * noise(10, HEIGHT, WIDTH)]), dtype=float)
-    hard = watch(lgmd.Params(suppression=5.0), frames)
+    hard = respond(lgmd.Params(suppression=5.0), frames)
     assert 0 < np.mean(hard.u == 0.5) < 1
 
     def difference(width):
         params = lgmd.Params(suppression=5.0, smooth=True, threshold_width=width, suppression_width=width)
-        return float(jnp.abs(watch(params, frames).u - hard.u).mean())
+        return float(jnp.abs(respond(params, frames).u - hard.u).mean())
 
     errors = [difference(width) for width in (3.0, 1.0, 0.3, 0.1, 0.01)]
     assert errors == sorted(errors, reverse=True), errors
@@ -162,61 +161,44 @@ def test_smooth_thresholds_tend_to_the_hard_ones(precision):
 
 
 def test_gradient_reaches_every_constant_through_the_smooth_form(precision, strict):
-    """Forward equals reverse; T_s and T_f have none through the steps, the others have."""
+    """Forward mode equals reverse mode; without `smooth` the gradients of T_s and T_f are zero, the others are not."""
     frames = jnp.asarray(0.1 * noise(4, 12, 14), dtype=float)
 
-    def told(params):
-        return watch(params, frames).u.sum()
+    def total_u(params):
+        return respond(params, frames).u.sum()
 
     params = lgmd.Params(threshold=3.0, suppression=8.0, smooth=True)
-    reverse = jax.jit(jax.grad(told))(params)
+    reverse = jax.jit(jax.grad(total_u))(params)
     for name, leaf in vars(reverse).items():
         assert isinstance(leaf, bool) or (np.all(np.isfinite(leaf)) and np.any(np.abs(leaf) > 1e-9)), name
     tangents = jax.tree.map(lambda leaf: jnp.cos(jnp.asarray(leaf)), params)
-    _, forward = jax.jit(lambda p, t: jax.jvp(told, (p,), (t,)))(params, tangents)
+    _, forward = jax.jit(lambda p, t: jax.jvp(total_u, (p,), (t,)))(params, tangents)
     products = jax.tree.map(lambda gradient, tangent: jnp.sum(gradient * tangent), reverse, tangents)
     np.testing.assert_allclose(forward, sum(jax.tree.leaves(products)), rtol=1e-4)
     np.testing.assert_allclose(reverse.kernel, reverse.kernel[::-1, ::-1], rtol=1e-5)
-    hard = jax.jit(jax.grad(told))(replace(params, smooth=False, suppression=1e3))
+    hard = jax.jit(jax.grad(total_u))(replace(params, smooth=False, suppression=1e3))
     assert hard.threshold == hard.suppression == 0
     assert abs(hard.inhibition) > 1e-9 and np.all(np.isfinite(hard.kernel))
 
 
 @pytest.mark.parametrize("smooth", [False, True])
-def test_gradient_is_finite_where_nothing_moves(smooth):
-    picture = jnp.full((6, 7), 80.0)
-    told = lambda params: lgmd.step(params, lgmd.init(params, picture), picture)[1].u  # noqa: E731
-    gradient = jax.jit(jax.grad(told))(lgmd.Params(smooth=smooth))
+def test_gradient_is_finite_without_motion(smooth):
+    image = jnp.full((6, 7), 80.0)
+    u = lambda params: lgmd.step(params, lgmd.init(params, image), image)[1].u  # noqa: E731
+    gradient = jax.jit(jax.grad(u))(lgmd.Params(smooth=smooth))
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
-def test_mirrored_pictures_give_the_same_response():
+def test_mirrored_images_give_the_same_response():
     frames = jnp.asarray(noise(5, 20, 31))
     for flipped in (frames[:, :, ::-1], frames[:, ::-1]):
-        np.testing.assert_allclose(watch(lgmd.Params(), flipped).u, watch(lgmd.Params(), frames).u, rtol=1e-12)
-
-
-@pytest.mark.parametrize("width", [320, 81])
-def test_hemifields_overlap_as_asked_and_mirror_each_other(width):
-    pictures = np.tile(np.arange(float(width)), (2, 3, 1))
-    for overlap in (0.5, 0.6, 1.0):
-        left = hemifield.hemifield(pictures, hemifield.LEFT, overlap)
-        right = hemifield.hemifield(pictures, hemifield.RIGHT, overlap)
-        assert left.shape == right.shape == (2, 3, np.ceil(overlap * width))
-        np.testing.assert_array_equal(left, (width - 1 - right)[..., ::-1])
-        assert left[0, 0, 0] == 0 and right[0, 0, -1] == width - 1
-
-
-@pytest.mark.parametrize(("side", "overlap"), [(0, 0.4), (1, 1.1), (0, float("nan")), (2, 0.6)])
-def test_a_hemifield_that_is_none_is_refused(side, overlap):
-    with pytest.raises(InputError, match="expected"):
-        hemifield.hemifield(np.zeros((4, 8)), side, overlap)
+        np.testing.assert_allclose(respond(lgmd.Params(), flipped).u, respond(lgmd.Params(), frames).u, rtol=1e-12)
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_pictures_that_do_not_fit_are_refused():
-    params, picture = lgmd.Params(), jnp.zeros((6, 8))
-    state = lgmd.init(params, picture)
+def test_unsuitable_frames_are_refused():
+    params, image = lgmd.Params(), jnp.zeros((6, 8))
+    state = lgmd.init(params, image)
     with pytest.raises(InputError, match=r"8 x 6 cells as before, got 8 x 5.*init again"):
         lgmd.step(params, state, jnp.zeros((5, 8)))
     with pytest.raises(InputError, match=r"uint8.*astype"):
@@ -237,7 +219,7 @@ def test_pictures_that_do_not_fit_are_refused():
         {"kernel": -jnp.asarray(lgmd.KERNEL)},
     ],
 )
-def test_constants_that_make_no_sense_are_refused(wrong):
+def test_impossible_parameters_are_refused(wrong):
     lgmd.check(lgmd.Params())
     with pytest.raises(InputError, match=f"lgmd {next(iter(wrong))}: expected"):
         lgmd.check(lgmd.Params(**wrong))  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""What is measured of a walk, on paths whose speed, turning and sway are known."""
+"""Gait metrics of trajectories with known speed, turning and sway."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from lgmdjax.evaluation import gait_test
 CYCLE = 1.0  # s
 
 
-def course(
+def trajectory(
     speed: float = 0.05,
     turn: float = 0.0,
     heading: float = 0.0,
@@ -18,16 +18,16 @@ def course(
     pitch: float = 0.0,
     yaw: float = 0.0,
     bounce: float = 0.0,
-) -> gait_test.Course:
-    """A walk at a steady speed and turn, with sway of these amplitudes, each at its own phase of the cycle."""
-    t = np.arange(round(seconds / gait_test.STEP)) * gait_test.STEP
+) -> gait_test.GaitTrajectory:
+    """Return a walk at constant speed and turn, with sway of these amplitudes, each at its own phase of the cycle."""
+    t = np.arange(round(seconds / gait_test.TIME_STEP)) * gait_test.TIME_STEP
     sway = lambda amplitude, phase: amplitude * np.sin(2 * np.pi * t / CYCLE + phase)  # noqa: E731
-    ways = heading + turn * t
-    steps = speed * gait_test.STEP * np.stack([np.cos(ways), np.sin(ways)], axis=1)
+    headings = heading + turn * t
+    steps = speed * gait_test.TIME_STEP * np.stack([np.cos(headings), np.sin(headings)], axis=1)
     position = np.column_stack([np.cumsum(steps, axis=0), 0.1 + sway(bounce, 0.3)])
     # Small angles, one after the other: yaw about z, pitch about y, roll about x.
-    quaternion = _product(_about(2, ways + sway(yaw, 0.7)), _about(1, sway(pitch, 1.1)), _about(0, sway(roll, 2.0)))
-    return gait_test.Course(position=position, quaternion=quaternion, feet=np.zeros((len(t), 6, 3)))
+    quaternion = _product(_about(2, headings + sway(yaw, 0.7)), _about(1, sway(pitch, 1.1)), _about(0, sway(roll, 2.0)))
+    return gait_test.GaitTrajectory(position=position, quaternion=quaternion, feet=np.zeros((len(t), 6, 3)))
 
 
 def _about(axis: int, angle: np.ndarray) -> np.ndarray:
@@ -48,43 +48,43 @@ def _product(*factors: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("speed", [0.05, -0.03, 0.0])
 @pytest.mark.parametrize("heading", [0.0, 2.0, np.pi])
 def test_speed_is_along_the_heading(speed, heading):
-    gauge = gait_test.gauge(course(speed, heading=heading), CYCLE)
-    assert gauge.speed == pytest.approx(speed, abs=1e-6)
-    assert gauge.yaw_rate == pytest.approx(0, abs=1e-9)
+    metrics = gait_test.measure_gait(trajectory(speed, heading=heading), CYCLE)
+    assert metrics.speed == pytest.approx(speed, abs=1e-6)
+    assert metrics.yaw_rate == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("turn", [0.01, -0.01, 0.4, -0.4])
-def test_turning_is_counted_through_full_circles(turn):
-    """Positive to the left, 8 rad in 20 s at most; a drift is what the heading came to."""
-    gauge = gait_test.gauge(course(0.0, turn), CYCLE)
-    assert gauge.yaw_rate == pytest.approx(turn, abs=1e-6)
-    assert gauge.drift == pytest.approx(20 * turn, rel=1e-3)
+def test_turning_is_unwrapped_through_full_circles(turn):
+    """Positive to the left, at most 8 rad in 20 s; the drift is the final heading."""
+    metrics = gait_test.measure_gait(trajectory(0.0, turn), CYCLE)
+    assert metrics.yaw_rate == pytest.approx(turn, abs=1e-6)
+    assert metrics.drift == pytest.approx(20 * turn, rel=1e-3)
 
 
 def test_sway_is_its_rms_about_the_mean_and_the_trend():
     amplitudes = {"roll": 0.01, "pitch": 0.02, "yaw": 0.03, "bounce": 0.002}
     for name, amplitude in amplitudes.items():
-        gauge = gait_test.gauge(course(0.05, 0.1, **{name: amplitude}), CYCLE)
-        assert getattr(gauge, name) == pytest.approx(amplitude / np.sqrt(2), rel=0.02), name
+        metrics = gait_test.measure_gait(trajectory(0.05, 0.1, **{name: amplitude}), CYCLE)
+        assert getattr(metrics, name) == pytest.approx(amplitude / np.sqrt(2), rel=0.02), name
         for other in amplitudes.keys() - {name}:
-            assert getattr(gauge, other) < 1e-3 * amplitude + 1e-6, (name, other)
+            assert getattr(metrics, other) < 1e-3 * amplitude + 1e-6, (name, other)
 
 
-def test_sway_does_not_tilt_what_is_measured_of_the_way():
-    """Whole cycles only: one and a half cycles more or less of yawing is no turning, and no speed."""
+def test_sway_does_not_change_speed_and_yaw_rate():
+    """Only whole cycles are measured, so part of a cycle of yaw is neither turning nor speed."""
     for seconds in (10.0, 10.5, 11.3):
-        gauge = gait_test.gauge(course(0.05, seconds=seconds, yaw=0.05), CYCLE)
-        assert gauge.yaw_rate == pytest.approx(0, abs=1e-4)
-        assert gauge.speed == pytest.approx(0.05, rel=2e-3)
+        metrics = gait_test.measure_gait(trajectory(0.05, seconds=seconds, yaw=0.05), CYCLE)
+        assert metrics.yaw_rate == pytest.approx(0, abs=1e-4)
+        assert metrics.speed == pytest.approx(0.05, rel=2e-3)
 
 
-def test_the_start_is_left_out():
-    """However the robot swings while its gait settles, the walk afterwards is what counts."""
-    steady, wild = course(), course(roll=0.3, pitch=0.2, bounce=0.05)
-    settling = np.arange(len(steady.position)) < round(gait_test.SETTLING / gait_test.STEP)
-    mixed = gait_test.Course(
-        position=np.where(settling[:, None], wild.position, steady.position),
-        quaternion=np.where(settling[:, None], wild.quaternion, steady.quaternion),
+def test_the_settling_time_is_left_out():
+    """Sway while the gait settles does not change the metrics."""
+    steady, swaying = trajectory(), trajectory(roll=0.3, pitch=0.2, bounce=0.05)
+    settling = np.arange(len(steady.position)) < round(gait_test.SETTLING_TIME / gait_test.TIME_STEP)
+    mixed = gait_test.GaitTrajectory(
+        position=np.where(settling[:, None], swaying.position, steady.position),
+        quaternion=np.where(settling[:, None], swaying.quaternion, steady.quaternion),
         feet=steady.feet,
     )
-    assert gait_test.gauge(mixed, CYCLE) == gait_test.gauge(steady, CYCLE)
+    assert gait_test.measure_gait(mixed, CYCLE) == gait_test.measure_gait(steady, CYCLE)

@@ -1,4 +1,4 @@
-"""Scores of walks whose answer is known by hand, and intervals against published tables and simulation."""
+"""Metrics of walks with known results, and intervals against published tables and simulation."""
 
 import numpy as np
 import pytest
@@ -17,20 +17,20 @@ def test_sway_does_not_count_as_distance():
     assert result.speed == pytest.approx(SPEED, rel=0.02)
 
 
-def test_setback_is_not_walked_and_a_touch_counts_once():
+def test_a_reset_adds_no_distance_and_a_contact_counts_once():
     record = walk(1)
-    contact, setbacks, position = (np.array(x) for x in (record.contact, record.setbacks, record.position))
+    contact, resets, position = (np.array(x) for x in (record.contact, record.resets, record.position))
     contact[0, 600] = True
-    setbacks[0, 601:] = 1
+    resets[0, 601:] = 1
     position[0, 601:, 0] += 3.0  # lifted 3 m ahead
-    result = metrics.score(walk(1, contact=contact, setbacks=setbacks, position=position), CYCLE)
+    result = metrics.score(walk(1, contact=contact, resets=resets, position=position), CYCLE)
     assert result.collisions == 1
     assert result.distance == pytest.approx(SPEED * FRAMES / 30, rel=0.05)
     assert result.first_collision.value == pytest.approx(SPEED * 20, rel=0.05)
     assert result.per_100_m.value == pytest.approx(100 / result.distance)
 
 
-def test_lost_robot_counts_for_nothing_after_it_fell():
+def test_frames_after_a_fall_do_not_count():
     ok = np.ones((2, FRAMES), bool)
     ok[1, 300:] = False
     contact = np.zeros((2, FRAMES), bool)
@@ -40,19 +40,19 @@ def test_lost_robot_counts_for_nothing_after_it_fell():
     assert result.distance == pytest.approx(SPEED * (40 + 10), rel=0.02)
 
 
-def test_walk_without_distance_is_an_input_error():
+def test_walks_without_distance_are_an_input_error():
     with pytest.raises(InputError, match="distance"):
         metrics.score(walk(1, ok=np.zeros((1, FRAMES), bool)), CYCLE)
 
 
 @pytest.mark.parametrize(("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.390)])
 def test_poisson_interval_matches_the_published_table(count, low, high):
-    """Garwood's limits as tabulated, for example, in Ulm (1990)."""
+    """Garwood's limits as tabulated in Ulm (1990)."""
     estimate = metrics.poisson_rate(count, 1.0)
     assert (estimate.low, estimate.high) == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=1e-3))
 
 
-def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
+def test_bootstrap_covers_the_mean_at_about_its_confidence():
     rng = np.random.default_rng(0)
     intervals = [metrics.bootstrap_mean(rng.exponential(1.0, 40)) for _ in range(100)]
     covered = sum(interval.low <= 1.0 <= interval.high for interval in intervals)
@@ -62,7 +62,7 @@ def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
 @pytest.mark.parametrize(("count", "low", "high"), [(15, 0.7961, 1.0), (0, 0.0, 0.2039), (7, 0.2481, 0.6988)])
 def test_wilson_interval_matches_its_formula(count, low, high):
     """Wilson's limits for n = 15, worked out by hand from (p + z^2/2n +- z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n)."""
-    estimate = metrics.wilson(count, 15)
+    estimate = metrics.wilson_proportion(count, 15)
     assert (estimate.low, estimate.high) == (pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))
 
 

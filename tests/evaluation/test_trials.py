@@ -1,4 +1,6 @@
-"""The paper's experiments: what robots are put before, and how it is judged whether they got through."""
+"""The paper's trials: their rooms, and the outcomes of walks."""
+
+from typing import get_args
 
 import jax
 import numpy as np
@@ -6,6 +8,7 @@ import pytest
 from synthetic import walk
 
 from lgmdjax.evaluation import trials
+from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.world import arena, scenes
 
 KEY = jax.random.key(8)
@@ -15,20 +18,25 @@ TUBE = trials.TRIALS["tube"]
 
 @pytest.fixture(scope="module")
 def rooms():
-    return {name: trials.TRIALS[name].rooms(KEY, 2) for name in SCENES}
+    return {name: trials.TRIALS[name].make_rooms(KEY, 2) for name in SCENES}
+
+
+def test_names_of_the_trials_are_those_of_the_settings():
+    assert tuple(trials.TRIALS) == get_args(TrialName)
+    assert all(name == trial.name for name, trial in trials.TRIALS.items())
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_rooms_are_sound_and_starts_nearly_where_the_paper_has_them(rooms, name):
+def test_rooms_are_valid_and_starts_are_near_those_of_the_paper(rooms, name):
     batch = rooms[name]
     arena.validate(batch.arena)
     np.testing.assert_array_equal(batch.starts[:, 0], batch.arena.start)
-    meant = np.array([0, 0, np.pi / 4 if name == "corner" else 0])
-    assert np.all(np.abs(np.abs(batch.arena.start) - meant) <= np.array(trials.LIBERTY) + 1e-12)
+    expected = np.array([0, 0, np.pi / 4 if name == "corner" else 0])
+    assert np.all(np.abs(np.abs(batch.arena.start) - expected) <= np.array(trials.START_JITTER) + 1e-12)
     assert len(np.unique(batch.arena.start[:, 0])) > 1
 
 
-def test_tube_stands_at_fifteen_distances_to_either_side(rooms):
+def test_the_tube_is_at_fifteen_lateral_offsets_to_either_side(rooms):
     tubes = np.asarray(rooms["tube"].arena.cylinders.centre)[:, 0]
     assert tubes.shape == (2 * 15 * 2, 2)
     np.testing.assert_allclose(tubes[:, 0], 1.25)
@@ -44,27 +52,27 @@ def test_every_second_room_is_a_mirror_image(rooms):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_no_texture_is_one_of_the_training_room(rooms, name):
-    known = np.asarray(scenes.training_room().boxes.texture)
-    seen = np.asarray(rooms[name].arena.boxes.texture).reshape(-1, 4)
-    assert not np.any(np.all(np.isclose(seen[:, None], known[None]), axis=-1))
+def test_no_texture_occurs_in_the_training_room(rooms, name):
+    training = np.asarray(scenes.training_room().boxes.texture)
+    textures = np.asarray(rooms[name].arena.boxes.texture).reshape(-1, 4)
+    assert not np.any(np.all(np.isclose(textures[:, None], training[None]), axis=-1))
 
 
-def test_a_robot_that_passes_has_got_through_whatever_it_touches_later():
-    """At 0.05 m/s it has passed the tube, by 0.4 m, after 33 s of 40."""
+def test_contacts_after_passing_do_not_count():
+    """At 0.05 m/s a robot is 0.4 m beyond the tube after 33 s of 40 s."""
     contact = np.zeros((2, 1200), bool)
     contact[0, 1100], contact[1, 500] = True, True
     clearance = np.full((2, 1200), 0.3)
     clearance[0, 700], clearance[0, 1100], clearance[1, 500] = 0.1, 0.0, -0.01
-    outcome = trials.judge(TUBE, walk(contact=contact, clearance=clearance))
+    outcome = trials.find_outcome(TUBE, walk(contact=contact, clearance=clearance))
     assert outcome.touched.tolist() == [False, True]
     assert outcome.frames.tolist() == [pytest.approx(1.65 / 0.05 * 30, abs=2), 501]
     np.testing.assert_allclose(outcome.clearance, [0.1, -0.01])
     assert outcome.avoided().value == 0.5
 
 
-def test_a_robot_that_turns_back_has_retreated_and_one_that_is_lost_has_not_got_through():
-    """A third one comes round again, and passes."""
+def test_a_robot_that_turns_back_has_retreated_and_a_lost_robot_has_failed():
+    """A third robot turns back, turns again and passes."""
     yaw = np.zeros((3, 1200))
     yaw[0] = np.linspace(0, 3.0, 1200)
     yaw[2, 100:300] = 3.0
@@ -73,13 +81,13 @@ def test_a_robot_that_turns_back_has_retreated_and_one_that_is_lost_has_not_got_
     position = np.zeros((3, 1200, 3))
     position[2, 900:, 0] = 2.0
     quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
-    outcome = trials.judge(TUBE, walk(3, quaternion=quaternion, ok=ok, position=position))
+    outcome = trials.find_outcome(TUBE, walk(3, quaternion=quaternion, ok=ok, position=position))
     assert outcome.retreated.tolist() == [True, False, False]
     assert outcome.passed.tolist() == [False, False, True]
     assert outcome.touched.tolist() == [False, True, False]
     assert outcome.frames.tolist() == [1200, 601, 901]
 
 
-def test_a_robot_that_stays_out_is_judged_at_the_end():
-    outcome = trials.judge(TUBE, walk(1, frames=300))
+def test_a_trial_without_contact_or_passing_ends_with_the_record():
+    outcome = trials.find_outcome(TUBE, walk(1, frames=300))
     assert (outcome.frames.tolist(), outcome.touched.tolist(), outcome.retreated.tolist()) == ([300], [False], [False])

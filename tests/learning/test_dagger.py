@@ -1,4 +1,4 @@
-"""Practice: who walks, what is learned from, and what a kill between two crowds leaves."""
+"""DAgger: what each round is fitted to, who walks in it, and how an interrupted run resumes."""
 
 from dataclasses import replace
 
@@ -14,37 +14,40 @@ from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording
 
 SETTINGS = TrainSettings(
-    eyes=CameraSettings(width=16, height=12), epochs=1, rounds=2, round_epochs=1, robots=4, round_seconds=0.1
+    eyes=CameraSettings(width=16, height=12), epochs=1, dagger_rounds=2, round_epochs=1, robots=4, round_seconds=0.1
 )
 
 
 @pytest.fixture
-def drive(monkeypatch):
-    """Stand-ins for walking and fitting: crowds of two, a pupil whose outputs tell what it learned from."""
-    seen = []
+def run_dagger(monkeypatch):
+    """Run DAgger with stand-ins for rollout and fit: batches of two robots, a learner that shows its training data.
+
+    The learner's `output_mean` is one plus the number of segments that it was fitted to; `seen` has it per batch.
+    """
+    seen, interrupt_at = [], [0]
 
     def fit(params, train, test, settings, checkpoints):
-        taught = replace(params, output_mean=np.full(2, 1.0 + len(train) + len(test)))
-        return behaviour_cloning.Fit(params=taught, best=taught, train=np.zeros(1), test=np.zeros(1))
+        fitted = replace(params, output_mean=np.full(2, 1.0 + len(train) + len(test)))
+        return behaviour_cloning.FitResult(params=fitted, best=fitted, train_mse=np.zeros(1), test_mse=np.zeros(1))
 
-    def walks(params, model, rooms, seconds, label, *, draw):
-        pupil = next(one for one in params.controller.driver.drivers if isinstance(one, navigator.Params))
-        seen.append(float(pupil.output_mean[0]))
-        if len(seen) == drive.killed_at:
+    def rollout(params, model, rooms, seconds, label, *, render):
+        learner = next(one for one in params.controller.policy.policies if isinstance(one, navigator.Params))
+        seen.append(float(learner.output_mean[0]))
+        if len(seen) == interrupt_at[0]:
             raise KeyboardInterrupt
         yield walk(len(rooms.starts), frames=150)
 
-    def drive(folder, recorded, killed_at=0):
+    def run(folder, recorded, at_batch=0):
         seen.clear()
-        drive.killed_at = killed_at
-        robot = closed_loop.assemble(assembly.everyone())
-        return dagger.practise(folder, robot, recorded, SETTINGS, seed=0), list(seen)
+        interrupt_at[0] = at_batch
+        robot = closed_loop.assemble(assembly.make_policies())
+        return dagger.run(folder, robot, recorded, SETTINGS, seed=0), list(seen)
 
-    monkeypatch.setattr(recording, "CROWD", 2)
-    monkeypatch.setattr(recording, "walks", walks)
+    monkeypatch.setattr(recording, "BATCH_SIZE", 2)
+    monkeypatch.setattr(recording, "rollout_with_progress", rollout)
     monkeypatch.setattr(behaviour_cloning, "fit", fit)
-    monkeypatch.setattr(behaviour_cloning, "enliven", lambda params, walks: params)
-    return drive
+    monkeypatch.setattr(behaviour_cloning, "rescale_turns", lambda params, walks: params)
+    return run
 
 
 @pytest.fixture
@@ -53,69 +56,69 @@ def recorded():
     return [episodes.Walk(episode=0, robot=k, room=k, seed=0, **fields[k]) for k in range(8)]
 
 
-def test_every_round_learns_from_all_walks_so_far_in_rooms_of_their_own(drive, recorded, tmp_path):
-    walks, seen = drive(tmp_path, recorded)
-    assert seen == [9.0, 9.0, 13.0, 13.0]  # 8 stretches, then 4 more; two crowds each
+def test_every_round_is_fitted_to_all_walks_so_far_and_has_rooms_of_its_own(run_dagger, recorded, tmp_path):
+    walks, seen = run_dagger(tmp_path, recorded)
+    assert seen == [9.0, 9.0, 13.0, 13.0]  # 8 segments, then 4 more; two batches each
     assert len(walks) == 16 and len({one.room for one in walks}) == 16
-    again = dagger.practised(tmp_path)
+    again = dagger.read_rounds(tmp_path)
     assert [one.room for one in again] == [one.room for one in walks[8:]]
 
 
-def test_after_a_kill_between_two_crowds_the_same_pupil_walks_on(drive, recorded, tmp_path):
+def test_a_round_interrupted_between_batches_resumes_with_the_same_learner(run_dagger, recorded, tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        drive(tmp_path, recorded, killed_at=2)
-    walks, seen = drive(tmp_path, recorded)
+        run_dagger(tmp_path, recorded, at_batch=2)
+    walks, seen = run_dagger(tmp_path, recorded)
     assert seen == [9.0, 13.0, 13.0]
     assert len(walks) == 16
 
 
-def test_what_is_done_is_not_walked_again(drive, recorded, tmp_path):
-    before, _ = drive(tmp_path, recorded)
-    after, seen = drive(tmp_path, recorded)
+def test_finished_rounds_are_not_repeated(run_dagger, recorded, tmp_path):
+    before, _ = run_dagger(tmp_path, recorded)
+    after, seen = run_dagger(tmp_path, recorded)
     assert seen == []
     jax.tree.map(np.testing.assert_array_equal, [vars(one) for one in before], [vars(one) for one in after])
 
 
-def test_no_room_is_in_two_of_the_three_parts(recorded):
-    parts = [{one.room for one in part} for part in dagger.split(recorded, seed=3)]
+def test_the_three_parts_share_no_room(recorded):
+    parts = [{one.room for one in part} for part in dagger.split_rooms(recorded, seed=3)]
     assert sum(map(len, parts)) == len(set.union(*parts)) == 8
     assert all(parts)
 
 
-def test_an_approach_lasts_until_the_robot_was_twice_as_far():
-    """Three robots: one sways over the bound, one comes back after it was free, one is put down anew in between."""
+def test_an_approach_ends_when_the_robot_is_twice_as_far_away():
+    """Of three robots one sways across the threshold, one leaves and returns, and one is reset in between."""
     clearance = np.full((3, 60), 0.12)
     clearance[0, 10:40:2] = 0.05
     clearance[1, [10, 30]], clearance[1, 20] = 0.05, 0.3
     clearance[2, [10, 30]] = 0.05
-    fresh = np.zeros((3, 60), bool)
-    fresh[2, 20] = True
-    assert dagger.approaches(walk(3, frames=60, clearance=clearance, fresh=fresh)) == 1 + 2 + 2
+    is_first = np.zeros((3, 60), bool)
+    is_first[2, 20] = True
+    assert dagger.count_approaches(walk(3, frames=60, clearance=clearance, is_first=is_first)) == 1 + 2 + 2
 
 
-def test_caution_is_the_least_of_those_that_come_too_near_least_often(recorded, tmp_path, monkeypatch):
-    """Robots come too near `3, 1, 1` times in as much of a way; nothing is walked where there is no choice."""
-    times = {1.5: 3, 2.0: 1, 2.5: 1}
+def test_the_smallest_turn_gain_with_the_fewest_approaches_is_selected(recorded, tmp_path, monkeypatch):
+    """Over the same distance there are 3, 1 and 1 approaches; without a choice no robot walks."""
+    approaches = {1.5: 3, 2.0: 1, 2.5: 1}
 
-    def walked(folder, pupil, rooms, seconds, driver, *, facts, **_):
+    def record_rollouts(folder, learner, rooms, seconds, policy, *, parameters, **_):
         clearance = np.full((len(rooms.starts), 600), 0.3)
-        for time in range(times[facts["caution"]]):
-            clearance[0, 100 * (time + 1) : 100 * (time + 1) + 20] = 0.05
+        for k in range(approaches[parameters["caution"]]):
+            clearance[0, 100 * (k + 1) : 100 * (k + 1) + 20] = 0.05
         return walk(len(rooms.starts), frames=600, clearance=clearance)
 
-    monkeypatch.setattr(recording, "walked", walked)
+    monkeypatch.setattr(recording, "record_rollouts", record_rollouts)
     monkeypatch.setattr(
-        behaviour_cloning, "enliven", lambda params, walks, caution=1.5: replace(params, output_scale=caution)
+        behaviour_cloning, "rescale_turns", lambda params, walks, turn_gain=1.5: replace(params, output_scale=turn_gain)
     )
-    robot, params = closed_loop.assemble(assembly.everyone()), navigator.create(jax.random.key(0))
-    fit = behaviour_cloning.Fit(params=params, best=params, train=np.zeros(1), test=np.zeros(1))
-    choice = replace(SETTINGS, cautions=tuple(times))
-    chosen, rows = dagger.tempered(tmp_path, robot, fit, recorded, choice, seed=0)
+    robot, params = closed_loop.assemble(assembly.make_policies()), navigator.create(jax.random.key(0))
+    fit = behaviour_cloning.FitResult(params=params, best=params, train_mse=np.zeros(1), test_mse=np.zeros(1))
+    several = replace(SETTINGS, turn_gains=tuple(approaches))
+    chosen, rows = dagger.select_turn_gain(tmp_path, robot, fit, recorded, several, seed=0)
     assert chosen.output_scale == 2.0
     assert [(row["caution"], row["tight"], row["chosen"]) for row in rows] == [
         (1.5, 3, False),
         (2.0, 1, True),
         (2.5, 1, False),
     ]
-    chosen, rows = dagger.tempered(tmp_path, robot, fit, recorded, SETTINGS, seed=0)
-    assert chosen.output_scale == 1.5 and rows == [{"caution": behaviour_cloning.CAUTION, "chosen": True}]
+    chosen, rows = dagger.select_turn_gain(tmp_path, robot, fit, recorded, SETTINGS, seed=0)
+    assert chosen.output_scale == 1.5 and rows == [{"caution": behaviour_cloning.TURN_GAIN, "chosen": True}]

@@ -1,8 +1,7 @@
-"""Legs and gait: kinematics against C MuJoCo, the foot's path as a person would look at it, and the lesson."""
+"""Tripod gait and its fit: the foot path, load, servo targets, and the fitted networks."""
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
@@ -10,7 +9,7 @@ from lgmdjax.body import hexapod
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
 
 TRIPODS = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.5])
-RANGE = np.linspace(shaping.SLOWEST, shaping.FASTEST, 7)
+VELOCITIES = np.linspace(shaping.MIN_VELOCITY, shaping.MAX_VELOCITY, 7)
 
 
 @pytest.fixture(scope="module")
@@ -20,192 +19,153 @@ def body():
 
 @pytest.fixture(scope="module")
 def geometry(body):
-    return tripod_gait.geometry(body)
+    return kinematics.read_geometry(body)
 
 
 @pytest.fixture(scope="module")
-def taught(geometry):
-    """A short lesson, enough to look at; the packaged networks had twenty times as long."""
+def fitted(geometry):
+    """Fit networks in 300 steps, a twentieth of those of the pretrained networks; return them and the losses."""
     losses = []
-    networks = gait_fit.teach(geometry, steps=300, candidates=6, progress=lambda *told: losses.append(told))
+    networks = gait_fit.fit(geometry, steps=300, candidates=6, progress=lambda *progress: losses.append(progress))
     return networks, losses
 
 
-def test_forward_kinematics_equal_mujocos(body, geometry):
-    data = mujoco.MjData(body)
-    feet = [body.site(f"{leg}_foot").id for leg in hexapod.LEGS]
-    for angles in np.random.default_rng(0).uniform(-1.2, 1.2, (20, 6, 3)):
-        data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *angles.ravel()]
-        mujoco.mj_kinematics(body, data)
-        np.testing.assert_allclose(kinematics.forward(geometry, jnp.asarray(angles)), data.site_xpos[feet], atol=1e-6)
-
-
-def test_inverse_undoes_forward(geometry):
-    low, high = np.array([-1.3, -0.3, -0.6]), np.array([1.3, 1.2, 1.1])
-    angles = jnp.asarray(np.random.default_rng(1).uniform(low, high, (200, 6, 3)))  # no foot behind its coxa
-    feet = kinematics.forward(geometry, angles)
-    np.testing.assert_allclose(kinematics.inverse(geometry, feet), angles, atol=1e-9)
-
-
-def test_a_foot_out_of_reach_stretches_the_leg_towards_it(geometry):
-    home = tripod_gait.homes(tripod_gait.Gait())
-    far = geometry.mounts + 3.0 * (home - geometry.mounts)
-    angles = kinematics.inverse(geometry, far)
-    np.testing.assert_allclose(angles[:, 2], np.pi / 2, atol=1e-9)  # knee straight
-    reached = kinematics.forward(geometry, angles) - geometry.mounts
-    towards = far - geometry.mounts
-    np.testing.assert_allclose(
-        np.arctan2(reached[:, 1], reached[:, 0]), np.arctan2(towards[:, 1], towards[:, 0]), atol=1e-9
-    )
-
-
-@pytest.mark.parametrize("where", ["out of reach", "on the coxa's axis", "on the femur's axis"])
-def test_gradients_stay_finite_where_angles_are_not_defined(geometry, where):
-    direction = jnp.stack([jnp.cos(geometry.mount_yaws), jnp.sin(geometry.mount_yaws), jnp.zeros(6)], axis=1)
-    feet = {
-        "out of reach": geometry.mounts + 1.0,
-        "on the coxa's axis": geometry.mounts - jnp.array([0.0, 0.0, 0.1]),
-        "on the femur's axis": geometry.mounts + geometry.coxa * direction,
-    }[where]
-    angles = kinematics.inverse(geometry, feet)
-    slope = jax.jacrev(lambda feet: kinematics.inverse(geometry, feet))(feet)
-    assert np.all(np.isfinite(angles)) and np.all(np.isfinite(slope))
-
-
-def test_the_standing_foot_goes_backward_at_constant_speed():
-    figures = tripod_gait.Gait()
-    phase = jnp.linspace(0.0, figures.duty - 1e-6, 50)
-    for v in RANGE:
-        path = tripod_gait.foot_path(figures, phase, jnp.full(50, v))
-        speed = np.gradient(path[:, 0], phase * figures.cycle_time)
-        np.testing.assert_allclose(speed, -0.05 * v * figures.stride_gain, atol=1e-9)
+def test_a_standing_foot_moves_backward_at_constant_speed():
+    gait = tripod_gait.Gait()
+    phase = jnp.linspace(0.0, gait.duty_factor - 1e-6, 50)
+    for v in VELOCITIES:
+        path = tripod_gait.foot_path(gait, phase, jnp.full(50, v))
+        speed = np.gradient(path[:, 0], phase * gait.cycle_time)
+        np.testing.assert_allclose(speed, -0.05 * v * gait.stride_gain, atol=1e-9)
         np.testing.assert_allclose(path[:, 1:], 0.0, atol=1e-9)
 
 
-def test_the_swinging_foot_goes_forward_high_and_lands_softly():
-    figures = tripod_gait.Gait()
-    phase = jnp.linspace(figures.duty, 1.0, 200)
-    path = tripod_gait.foot_path(figures, phase, jnp.ones(200))
-    assert path[-1, 0] - path[0, 0] == pytest.approx(0.05 * figures.stride_gain * 0.8 * figures.duty)
-    assert np.max(path[:, 2]) == pytest.approx(figures.lift, rel=1e-3)
+def test_a_swinging_foot_moves_forward_above_the_floor_and_lands_softly():
+    gait = tripod_gait.Gait()
+    phase = jnp.linspace(gait.duty_factor, 1.0, 200)
+    path = tripod_gait.foot_path(gait, phase, jnp.ones(200))
+    assert path[-1, 0] - path[0, 0] == pytest.approx(0.05 * gait.stride_gain * 0.8 * gait.duty_factor)
+    assert np.max(path[:, 2]) == pytest.approx(gait.swing_height, rel=1e-3)
     assert np.all(path[:, 2] >= 0)
-    falling = np.gradient(path[:, 2], phase)
-    assert abs(falling[-1]) < 0.05 * np.abs(falling).max()
+    vertical = np.gradient(path[:, 2], phase)
+    assert abs(vertical[-1]) < 0.05 * np.abs(vertical).max()
 
 
-def test_the_path_is_closed_and_smooth_around_the_cycle():
-    figures = tripod_gait.Gait()
+def test_the_path_is_closed_and_smooth_over_the_cycle():
+    gait = tripod_gait.Gait()
     phase = jnp.linspace(0.0, 1.0, 20_001)
-    for v in RANGE:
-        path = np.asarray(tripod_gait.foot_path(figures, phase, jnp.full(phase.shape, v)))
+    for v in VELOCITIES:
+        path = np.asarray(tripod_gait.foot_path(gait, phase, jnp.full(phase.shape, v)))
         np.testing.assert_allclose(path[0], path[-1], atol=1e-9)
         velocity = np.diff(np.concatenate([path, path[1:3]]), axis=0) * 20_000
         assert np.abs(np.diff(velocity, axis=0)).max() < 0.01 * np.abs(velocity).max()
 
 
-def test_the_stride_follows_the_velocity_and_its_sign():
-    figures, phase = tripod_gait.Gait(), jnp.array([0.0, 0.3, 0.7, 0.9])
-    one = tripod_gait.foot_path(figures, phase, jnp.ones(4))
-    for v in RANGE:
-        path = tripod_gait.foot_path(figures, phase, jnp.full(4, v))
+def test_the_stride_is_proportional_to_the_velocity():
+    gait, phase = tripod_gait.Gait(), jnp.array([0.0, 0.3, 0.7, 0.9])
+    one = tripod_gait.foot_path(gait, phase, jnp.ones(4))
+    for v in VELOCITIES:
+        path = tripod_gait.foot_path(gait, phase, jnp.full(4, v))
         np.testing.assert_allclose(path[:, 0], v * one[:, 0], atol=1e-12)
         np.testing.assert_allclose(path[:, 2], one[:, 2])  # it steps on the spot at v = 0
 
 
-def test_the_tripod_bears_the_weight_by_statics():
-    figures = tripod_gait.Gait()
+def test_the_load_of_a_tripod_is_in_equilibrium():
+    gait = tripod_gait.Gait()
     middle_of_stance, x = jnp.where(TRIPODS == 0, 0.27, 0.77), jnp.full(6, 0.02)
-    share = np.asarray(tripod_gait.load_share(figures, middle_of_stance, x))
-    feet = np.asarray(tripod_gait.homes(figures))[::2, :2] + np.array([0.02, 0.0])
+    share = np.asarray(tripod_gait.load_share(gait, middle_of_stance, x))
+    feet = np.asarray(tripod_gait.neutral_feet(gait))[::2, :2] + np.array([0.02, 0.0])
     np.testing.assert_allclose(share[1::2], 0.0)
     assert share.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(share[::2] @ feet, 0.0, atol=1e-12)  # no moment about the trunk's centre
 
 
-def test_the_two_tripods_hand_over_the_whole_weight():
+def test_the_loads_always_sum_to_the_weight():
     phase = jnp.linspace(0.0, 1.0, 201)[:, None] + TRIPODS
     share = tripod_gait.load_share(tripod_gait.Gait(), phase, jnp.zeros((201, 6)))
     np.testing.assert_allclose(share.sum(axis=1), 1.0, atol=1e-12)
     assert np.abs(np.diff(share, axis=0)).max() < 0.1
 
 
-def test_targets_keep_to_the_joints_and_mirror(body, geometry):
+def test_joint_targets_are_within_the_joint_ranges_and_symmetric(body, geometry):
     phase = jnp.linspace(0.0, 1.0, 41)[:, None, None] + jnp.zeros((41, 7, 6))
-    velocity = jnp.asarray(RANGE)[None, :, None] + jnp.zeros((41, 7, 6))
-    angles = np.asarray(tripod_gait.targets(geometry, tripod_gait.Gait(), phase, velocity))
+    velocity = jnp.asarray(VELOCITIES)[None, :, None] + jnp.zeros((41, 7, 6))
+    angles = np.asarray(tripod_gait.joint_targets(geometry, tripod_gait.Gait(), phase, velocity))
     low, high = body.jnt_range[1:].reshape(6, 3, 2).transpose(2, 0, 1)
     assert np.all((angles > low) & (angles < high))
     np.testing.assert_allclose(angles[..., ::-1, :] * np.array([-1, 1, 1]), angles, atol=1e-9)
 
 
-def test_targets_run_ahead_and_beyond(geometry):
-    """Without lag and weight they are the path itself; with them they lead it by the lag and press the feet down."""
-    figures, phase = tripod_gait.Gait(), jnp.full(6, 0.27)
+def test_joint_targets_compensate_for_lag_and_load(geometry):
+    """Without lag and weight they give the path itself; the lag shifts them in time, the weight lowers the feet."""
+    gait, phase = tripod_gait.Gait(), jnp.full(6, 0.27)
     bare = geometry.replace(lag=0.0, weight=0.0)
-    feet = kinematics.forward(geometry, tripod_gait.targets(bare, figures, phase, jnp.ones(6)))
-    home = tripod_gait.homes(figures)
-    np.testing.assert_allclose(feet - home, tripod_gait.foot_path(figures, phase, jnp.ones(6)), atol=1e-9)
-    loaded = kinematics.forward(geometry, tripod_gait.targets(geometry, figures, phase, jnp.ones(6)))
+    feet = kinematics.forward(geometry, tripod_gait.joint_targets(bare, gait, phase, jnp.ones(6)))
+    neutral = tripod_gait.neutral_feet(gait)
+    np.testing.assert_allclose(feet - neutral, tripod_gait.foot_path(gait, phase, jnp.ones(6)), atol=1e-9)
+    loaded = kinematics.forward(geometry, tripod_gait.joint_targets(geometry, gait, phase, jnp.ones(6)))
     assert np.all(loaded[:, 2] < feet[:, 2] - 1e-4)
-    led = kinematics.forward(geometry, tripod_gait.targets(bare.replace(lag=0.01), figures, phase, jnp.ones(6)))
-    np.testing.assert_allclose(led[:, 0] - feet[:, 0], -0.01 * 0.05 * figures.stride_gain, rtol=0.02)
+    early = kinematics.forward(geometry, tripod_gait.joint_targets(bare.replace(lag=0.01), gait, phase, jnp.ones(6)))
+    np.testing.assert_allclose(early[:, 0] - feet[:, 0], -0.01 * 0.05 * gait.stride_gain, rtol=0.02)
 
 
-def test_limit_cycle_is_the_settled_rhythm_whatever_the_cycle_time():
+def test_limit_cycle_rhythm_does_not_depend_on_the_cycle_time():
     phases = np.arange(8) / 8
-    settled = gait_fit.limit_cycle(cpg.Params(), phases)
-    assert settled[0, 0] == pytest.approx(0.0, abs=1e-3) and settled[1, 0] > 0
-    np.testing.assert_allclose(settled[:4], -settled[4:], atol=1e-3)
-    np.testing.assert_allclose(gait_fit.limit_cycle(cpg.Params(cycle_time=0.5), phases), settled, atol=1e-6)
+    rhythm = gait_fit.limit_cycle_rhythm(cpg.Params(), phases)
+    assert rhythm[0, 0] == pytest.approx(0.0, abs=1e-3) and rhythm[1, 0] > 0
+    np.testing.assert_allclose(rhythm[:4], -rhythm[4:], atol=1e-3)
+    np.testing.assert_allclose(gait_fit.limit_cycle_rhythm(cpg.Params(cycle_time=0.5), phases), rhythm, atol=1e-6)
 
 
 def foot_error(networks, geometry, velocity):
-    """RMS distance [mm] of the standing feet from where the gait wants them, around the cycle."""
-    figures, steps = tripod_gait.Gait(), 60
-    settled = gait_fit.limit_cycle(cpg.Params(), np.arange(steps) / steps)
+    """Return the RMS distance [mm] of the standing feet from those of the gait, over the cycle."""
+    gait, steps = tripod_gait.Gait(), 60
+    unit = gait_fit.limit_cycle_rhythm(cpg.Params(), np.arange(steps) / steps)
     phase = jnp.arange(steps)[:, None] / steps + TRIPODS
-    rhythm = jnp.asarray(np.stack([settled, np.roll(settled, -steps // 2, axis=0)] * 3, axis=1))
-    angles = jax.vmap(shaping.shape, (None, 0, None))(networks, rhythm, jnp.full(2, velocity))
-    wanted = kinematics.forward(geometry, tripod_gait.targets(geometry, figures, phase, jnp.full((steps, 6), velocity)))
-    missed = 1e3 * jnp.linalg.norm(kinematics.forward(geometry, angles) - wanted, axis=-1)
-    return float(jnp.sqrt(jnp.mean(missed**2, where=phase % 1 < figures.duty)))
+    rhythm = jnp.asarray(np.stack([unit, np.roll(unit, -steps // 2, axis=0)] * 3, axis=1))
+    angles = jax.vmap(shaping.apply, (None, 0, None))(networks, rhythm, jnp.full(2, velocity))
+    expected = kinematics.forward(
+        geometry, tripod_gait.joint_targets(geometry, gait, phase, jnp.full((steps, 6), velocity))
+    )
+    errors = 1e3 * jnp.linalg.norm(kinematics.forward(geometry, angles) - expected, axis=-1)
+    return float(jnp.sqrt(jnp.mean(errors**2, where=phase % 1 < gait.duty_factor)))
 
 
-def test_packaged_networks_put_standing_feet_where_the_gait_wants_them(geometry):
+def test_pretrained_networks_follow_the_gait_in_stance(geometry):
     for v in (0.5, 1.0, 1.2, 2.0):
-        assert foot_error(shaping.taught(), geometry, v) < 2.5
+        assert foot_error(shaping.load_pretrained(), geometry, v) < 2.5
 
 
-def test_the_lesson_is_learned_and_told(taught, geometry):
-    networks, losses = taught
+def test_the_fit_converges_and_reports_progress(fitted, geometry):
+    networks, losses = fitted
     assert foot_error(networks, geometry, 1.0) < 3.5
     steps, values = zip(*losses, strict=True)
     assert steps[-1] == 300 and list(steps) == sorted(steps)
     assert values[-1] < 0.7 * values[0]
 
 
-def test_right_legs_are_the_left_ones_mirrored(taught):
-    networks, _ = taught
+def test_right_legs_mirror_the_left_ones(fitted):
+    networks, _ = fitted
     rhythm, velocity = jax.random.normal(jax.random.key(5), (6, 2)) * 0.3, jnp.array([0.4, 1.3])
-    mirrored = shaping.shape(networks, rhythm[::-1], velocity[::-1])
-    angles = shaping.shape(networks, rhythm, velocity)
+    mirrored = shaping.apply(networks, rhythm[::-1], velocity[::-1])
+    angles = shaping.apply(networks, rhythm, velocity)
     np.testing.assert_allclose(mirrored[::-1] * jnp.array([-1.0, 1.0, 1.0]), angles, atol=1e-12)
 
 
-def test_the_papers_input_cannot_learn_it(geometry):
-    """A map of one scalar traces an open curve: the feet miss by more than half the stride."""
-    networks = gait_fit.teach(geometry, steps=150, candidates=6, literal=True)
-    assert networks.literal
+def test_the_printed_input_cannot_fit_the_gait(geometry):
+    """A function of one scalar traces an open curve: the feet are off by more than half the stride."""
+    networks = gait_fit.fit(geometry, steps=150, candidates=6, printed_input=True)
+    assert networks.printed_input
     assert foot_error(networks, geometry, 1.0) > 6.0
 
 
 def test_runs_in_either_precision(precision, strict, body):
-    geometry = tripod_gait.geometry(body)
-    angles = tripod_gait.targets(geometry, tripod_gait.Gait(), jnp.asarray(TRIPODS, dtype=float), jnp.ones(6))
+    geometry = kinematics.read_geometry(body)
+    angles = tripod_gait.joint_targets(geometry, tripod_gait.Gait(), jnp.asarray(TRIPODS, dtype=float), jnp.ones(6))
     assert angles.dtype == kinematics.forward(geometry, angles).dtype == precision
 
 
-def test_teaches_in_single_precision(float32, strict, body):
-    networks = gait_fit.teach(tripod_gait.geometry(body), steps=10, candidates=6)
+def test_fits_in_single_precision(float32, strict, body):
+    networks = gait_fit.fit(kinematics.read_geometry(body), steps=10, candidates=6)
     assert networks.w1.dtype == "float32"
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(networks))

@@ -1,4 +1,4 @@
-"""Rooms rebuilt in C MuJoCo, and distances in the plane point by point."""
+"""Rooms as models of C MuJoCo, and distances in the plane for single points."""
 
 import mujoco
 import numpy as np
@@ -7,8 +7,8 @@ from lgmdjax.world.arena import Arena
 
 
 def to_mjcf(arena: Arena) -> str:
-    """Write a still room as MJCF: floor, four thick walls, and what is not parked, named kind and row."""
-    x_min, x_max, y_min, y_max = (float(value) for value in arena.room)
+    """Return a room at rest as MJCF: floor, four thick walls, and the active obstacles, named by kind and row."""
+    x_min, x_max, y_min, y_max = (float(value) for value in arena.bounds)
     height, thick = float(arena.wall_height), 1.0
     x, y = (x_min + x_max) / 2, (y_min + y_max) / 2
     a, b = (x_max - x_min) / 2 + 2 * thick, (y_max - y_min) / 2 + 2 * thick
@@ -40,7 +40,7 @@ def _geom(name: str, kind: str, centre, size, yaw: float, z: float) -> str:
 
 
 def load(xml: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Compile a model and bring its shapes into place."""
+    """Compile a model and compute the poses of its geoms."""
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -58,13 +58,13 @@ def ray(model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, directi
 
 
 def segment(start: np.ndarray, end: np.ndarray, count: int = 400) -> np.ndarray:
-    """Points along a segment, ends included."""
+    """Return points along a segment, including its ends."""
     return start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
 
 
 def point_to_room(arena: Arena, points: np.ndarray) -> np.ndarray:
-    """Signed distance of plane points (n, 2) to the nearest wall or obstacle that can be touched."""
-    x_min, x_max, y_min, y_max = np.asarray(arena.room)
+    """Return the signed distance of plane points (n, 2) to the nearest wall or obstacle that is not overhead."""
+    x_min, x_max, y_min, y_max = np.asarray(arena.bounds)
     x, y = points.T
     nearest = np.min([x - x_min, x_max - x, y - y_min, y_max - y], axis=0)
     for row in range(arena.cylinders.yaw.shape[0]):

@@ -1,4 +1,4 @@
-"""Eqs. 18-22 line by line, from the paper."""
+"""Eqs. 18-22, transcribed from the paper."""
 
 
 def vehicle_2a(u_l: float, u_r: float, v_base: float, k_2a: float) -> tuple[float, float]:

@@ -1,6 +1,6 @@
-"""A fisheye picture by brute force: many hard rays a pixel, each traced through the room in NumPy, float64.
+"""A fisheye picture by brute force: many rays per pixel, each cast into the room in NumPy, in float64.
 
-Written from the geometry and from the definition of the patterns; nothing is filtered, everything is averaged.
+Written from the geometry and from the definition of the patterns. There is no filter; a pixel is the mean of its rays.
 """
 
 from typing import NamedTuple
@@ -12,12 +12,12 @@ from lgmdjax.world.texture import PHASES, WAVES, WEIGHTS
 
 class Picture(NamedTuple):
     grey: np.ndarray  # (rows, columns), mean of the samples
-    edge: np.ndarray  # (rows, columns), True where the samples meet more than one thing
+    edge: np.ndarray  # (rows, columns), True where the samples hit more than one surface
     distance: np.ndarray  # (rows, columns), of the last sample of a pixel [m], inf in the sky
 
 
 def picture(arena, position, rotation, width, height, fov, samples=64, bands=3, columns=slice(None)) -> Picture:
-    """Draw one eye with so many rays a pixel."""
+    """Render the picture of one eye with `samples` rays per pixel."""
     rows, cols = np.arange(height), np.arange(width)[columns]
     total, edge = np.zeros((len(rows), len(cols))), np.zeros((len(rows), len(cols)), bool)
     first = distance = None
@@ -32,16 +32,16 @@ def picture(arena, position, rotation, width, height, fov, samples=64, bands=3, 
 
 
 def lattice(samples):
-    """Points in the unit square, all of their rows and columns different.
+    """Return points in the unit square whose coordinates are all different.
 
-    A square grid of 64 has eight columns only: it would see an upright edge move in steps of an eighth of a pixel.
+    A square grid of 64 points has only eight columns: an upright edge would move in steps of an eighth of a pixel.
     """
     i = np.arange(samples)
     return np.stack([(i + 0.5) / samples, ((i * 0.6180339887498949) + 0.5) % 1.0], axis=-1)
 
 
 def directions(u, v, width, height, fov):
-    """Point in the picture -> unit vector (x forward, y left, z up): the angle from the axis is its radius."""
+    """Return unit vectors (x forward, y left, z up) of points in the picture; the radius is the angle from the axis."""
     right, down = np.broadcast_arrays(u - width / 2, v - height / 2)
     angle = np.hypot(right, down) * fov / width
     around = np.arctan2(down, right)
@@ -49,7 +49,7 @@ def directions(u, v, width, height, fov):
 
 
 def trace(arena, origin, rays):
-    """Distance and number of what each ray meets: -1 sky, 0 floor, 1..4 walls, then boxes, then cylinders."""
+    """Return distance and index of the surface that each ray hits: -1 sky, 0 floor, 1..4 walls, boxes, cylinders."""
     with np.errstate(divide="ignore", invalid="ignore"):
         best, thing = np.full(rays.shape[:-1], np.inf), np.full(rays.shape[:-1], -1)
 
@@ -59,12 +59,12 @@ def trace(arena, origin, rays):
 
         down = rays[..., 2] < 0
         meet(np.where(down, -origin[2] / rays[..., 2], np.inf), 0)
-        for wall, bound in enumerate(np.asarray(arena.room)):
+        for wall, bound in enumerate(np.asarray(arena.bounds)):
             axis = wall // 2
             ahead = rays[..., axis] > 0 if wall % 2 else rays[..., axis] < 0
             distance = np.where(ahead, (bound - origin[axis]) / rays[..., axis], np.inf)
             point = origin + np.where(np.isfinite(distance), distance, 0.0)[..., None] * rays
-            low, high = np.asarray(arena.room)[[2 - 2 * axis, 3 - 2 * axis]]
+            low, high = np.asarray(arena.bounds)[[2 - 2 * axis, 3 - 2 * axis]]
             across = point[..., 1 - axis]
             inside = (across >= low) & (across <= high) & (point[..., 2] <= arena.wall_height)
             meet(np.where(inside & (point[..., 2] >= 0), distance, np.inf), 1 + wall)
@@ -76,7 +76,7 @@ def trace(arena, origin, rays):
 
 
 def paint(arena, origin, rays, distance, thing, bands):
-    """Grey of what was met."""
+    """Return the grey level of the surface that each ray hits."""
     point = origin + np.where(np.isfinite(distance), distance, 0.0)[..., None] * rays
     floor_and_walls = np.concatenate([np.asarray(arena.floor_texture)[None], np.asarray(arena.wall_texture)])
     textures = np.concatenate([floor_and_walls, np.asarray(arena.boxes.texture), np.asarray(arena.cylinders.texture)])

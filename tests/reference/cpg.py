@@ -1,16 +1,16 @@
-"""The Matsuoka network of sec. 3.2 in NumPy, written out from eqs. 1-6, and solved with SciPy's DOP853."""
+"""The Matsuoka network of sec. 3.2 in NumPy, transcribed from eqs. 1-6 and solved with SciPy's DOP853."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 T_R, T_A, BETA, W_FE = 1.7, 1.5, 7.0, 4.0
-# Matrix W with its two weights swapped against the printed one: 0.40 across the tripods.
+# Matrix W with the two weights of the printed matrix swapped: 0.40 between the tripods.
 W = np.array([[0.0 if i == j else 0.04 if (i - j) % 2 == 0 else 0.40 for j in range(6)] for i in range(6)])
 W_PRINTED = np.array([[0.0 if i == j else 0.40 if (i - j) % 2 == 0 else 0.04 for j in range(6)] for i in range(6)])
 
 
 def derivative(y, *, coupling=W, w_fe=W_FE, tonic=1.0):
-    """Rates of y = (u^e, u^f, v^e, v^f), six each, a neuron at a time."""
+    """Return the time derivative of y = (u^e, u^f, v^e, v^f), six values each, one neuron at a time."""
     ue, uf, ve, vf = y.reshape(4, 6)
     rates = np.empty((4, 6))
     for i in range(6):
@@ -24,7 +24,7 @@ def derivative(y, *, coupling=W, w_fe=W_FE, tonic=1.0):
 
 
 def solve(start, times, **network):
-    """States at `times` (time units) from `start` at time 0; (steps, 4, 6)."""
+    """Return the states (steps, 4, 6) at `times` [time units] from `start` at time 0."""
     solution = solve_ivp(
         lambda t, y: derivative(y, **network),
         (0.0, times[-1]),
@@ -39,7 +39,7 @@ def solve(start, times, **network):
 
 
 def period(start, *, duration=67.0, **network):
-    """Mean time between upward crossings of zero by the first unit's output, found as events of the solver."""
+    """Return the mean time between upward zero crossings of the first unit's output, found as events of the solver."""
 
     def crossing(t, y):
         return y[0] - y[6]

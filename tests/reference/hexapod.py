@@ -1,4 +1,4 @@
-"""The robot by other means: C MuJoCo with the same obstacles, and a tripod gait from NumPy and the leg's triangle."""
+"""Independent models of the robot: C MuJoCo with the same barriers, and a tripod gait by trigonometry in NumPy."""
 
 import mujoco
 import numpy as np
@@ -9,16 +9,16 @@ MOUNT_YAWS = np.radians([45, 90, 135, -135, -90, -45])
 COXA, FEMUR, TIBIA = 0.052, 0.066, 0.133
 
 
-def twin(model: mujoco.MjModel, placed) -> mujoco.MjModel:
-    """Give C MuJoCo the barriers that an `mjx.Model` has been given."""
+def with_barriers(model: mujoco.MjModel, placed) -> mujoco.MjModel:
+    """Copy the barriers of an `mjx.Model` to a model of C MuJoCo and return it."""
     for name in ("geom_pos", "geom_quat"):
         getattr(model, name)[:] = np.asarray(getattr(placed, name))
-    model.geom_sameframe[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = 0  # they are turned now
+    model.geom_sameframe[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE] = 0  # they are no longer aligned with the body
     return model
 
 
 def angles(feet: np.ndarray) -> np.ndarray:
-    """Solve the triangle hip, knee, foot: joint angles (6, 3) of feet (6, 3) in the trunk's frame, knee up."""
+    """Return joint angles (6, 3) of feet (6, 3) in the trunk frame, from the triangle hip, knee, foot (knee up)."""
     x, y = (feet[:, :2] - MOUNTS).T
     coxa = (np.arctan2(y, x) - MOUNT_YAWS + np.pi) % (2 * np.pi) - np.pi
     reach, drop = np.hypot(x, y) - COXA, -feet[:, 2]
@@ -28,15 +28,15 @@ def angles(feet: np.ndarray) -> np.ndarray:
     return np.stack([coxa, femur, knee - np.pi / 2], axis=-1)
 
 
-def tripod(steps: int, velocity: tuple[float, float], homes: np.ndarray) -> np.ndarray:
-    """Walk at (left, right) [m/s] about the feet's homes [m]: joint angles (steps, 6, 3), a row each 1/180 s."""
+def tripod(steps: int, velocity: tuple[float, float], neutral_feet: np.ndarray) -> np.ndarray:
+    """Return joint angles (steps, 6, 3) of a tripod gait at (left, right) [m/s], one row for each 1/180 s."""
     sides = np.repeat(velocity, 3)
     rows = []
     for time in np.arange(steps) / 180:
-        phase = (time + np.array([0.0, 0.5] * 3)) % 1.0  # of a cycle of 1 s, the first half of it on the floor
+        phase = (time + np.array([0.0, 0.5] * 3)) % 1.0  # of a cycle of 1 s; stance in its first half
         swing = np.clip(2 * phase - 1, 0, 1)
         along = np.where(phase < 0.5, 0.5 - 2 * phase, swing - np.sin(2 * np.pi * swing) / (2 * np.pi) - 0.5)
-        feet = homes.copy()
+        feet = neutral_feet.copy()
         feet[:, 0] += along * sides * 0.5
         feet[:, 2] += 0.01 * (1 - np.cos(2 * np.pi * swing))
         rows.append(angles(feet))

@@ -1,4 +1,4 @@
-"""Eqs. 7-16 as they are read, cell by cell, in NumPy: slow, and written from the paper alone."""
+"""Eqs. 7-16 in NumPy, cell by cell, written from the paper alone."""
 
 import math
 from typing import Any
@@ -17,7 +17,7 @@ W_I = np.array(
 
 
 def inhibition_layer(P_before: np.ndarray) -> np.ndarray:
-    """Eq. 8; a cell beyond the border does not exist and so inhibits nobody."""
+    """Return the inhibition of eq. 8. Cells beyond the border do not exist and inhibit no cell."""
     h, w = P_before.shape
     inhibition = np.zeros((h, w))
     for y in range(h):
@@ -37,7 +37,7 @@ def lgmd(
     printed_feed_forward: bool = False,
     printed_gate: bool = False,
 ) -> list[dict[str, Any]]:
-    """Run eqs. 7-16 over a film; the first frame has no predecessor, and nothing had changed before it."""
+    """Run eqs. 7-16 over a sequence of frames. The first frame has no predecessor, and nothing changed before it."""
     P_before, L_before = np.zeros(frames[0].shape), frames[0]
     out = []
     for L in frames[1:]:

@@ -1,4 +1,4 @@
-"""Keras's LSTM layer and a dense one after it, from their documented formulas, in NumPy."""
+"""Keras's LSTM layer followed by a dense layer in NumPy, from the formulas in its documentation."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Videos come back as they were written; a damaged file is one line, not a shorter video."""
+"""Videos are read as they were written; a damaged file gives an error instead of a shorter video."""
 
 import io
 import struct
@@ -16,7 +16,7 @@ WIDTH, HEIGHT, FRAMES = 96, 64, 30
 
 
 def pictures(frames: int = FRAMES) -> np.ndarray:
-    """A bright bar that moves over coarse noise, another in each frame, grey."""
+    """Return grey pictures of a bright bar that moves over coarse noise, which changes in each frame."""
     coarse = np.random.default_rng(0).integers(0, 60, (frames, HEIGHT // 8, WIDTH // 8), np.uint8)
     grey = coarse.repeat(8, axis=1).repeat(8, axis=2)
     for i in range(frames):
@@ -25,7 +25,7 @@ def pictures(frames: int = FRAMES) -> np.ndarray:
 
 
 def encode(path: Path, frames: np.ndarray, codec: str = "h264", **options: str) -> Path:
-    """Write a video with PyAV alone, in the container that the name asks for."""
+    """Write a video with PyAV alone, in the container given by the name's suffix."""
     with av.open(str(path), "w", options=options) as container:
         stream = container.add_stream(codec, rate=30)
         assert isinstance(stream, av.VideoStream)
@@ -38,35 +38,35 @@ def encode(path: Path, frames: np.ndarray, codec: str = "h264", **options: str) 
 
 
 def read(path: Path, width: int = WIDTH, height: int = HEIGHT) -> list[video_io.Frame]:
-    with video_io.reading(path) as film:
-        return list(film.frames(width, height))
+    with video_io.open_reader(path) as video:
+        return list(video.frames(width, height))
 
 
-def cut(path: Path, share: float) -> Path:
+def truncate(path: Path, fraction: float) -> Path:
     content = path.read_bytes()
-    path.write_bytes(content[: int(share * len(content))])
+    path.write_bytes(content[: int(fraction * len(content))])
     return path
 
 
 @pytest.mark.parametrize(
     ("name", "codec"), [("a.mp4", "h264"), ("a.mkv", "h264"), ("a.avi", "mpeg4"), ("a.webm", "vp9")]
 )
-def test_every_frame_comes_back_in_time(tmp_path: Path, name: str, codec: str) -> None:
+def test_every_frame_is_read_with_its_time(tmp_path: Path, name: str, codec: str) -> None:
     written = pictures()
     path = encode(tmp_path / name, written, codec)
-    with video_io.reading(path) as film:
-        frames = list(film.frames(WIDTH, HEIGHT))
-        assert (film.width, film.height, float(film.rate)) == (WIDTH, HEIGHT, 30)
+    with video_io.open_reader(path) as video:
+        frames = list(video.frames(WIDTH, HEIGHT))
+        assert (video.width, video.height, float(video.rate)) == (WIDTH, HEIGHT, 30)
     assert len(frames) == FRAMES
     times = np.array([frame.time for frame in frames])
     assert np.allclose(times - times[0], np.arange(FRAMES) / 30, atol=2e-3)
     error = np.abs(np.stack([frame.picture for frame in frames]).astype(float) - written)
-    assert error.mean(axis=(1, 2)).max() < 8  # grey levels lost to the codec; 27 for a frame one off
+    assert error.mean(axis=(1, 2)).max() < 8  # grey levels lost by the codec; an offset by one frame would give 27
 
 
-def test_what_is_written_is_h264_and_keeps_its_grey_levels() -> None:
+def test_videos_are_written_as_h264_and_keep_their_grey_levels() -> None:
     file = io.BytesIO()
-    with video_io.writing(file, 32, 16, 30) as write:
+    with video_io.open_writer(file, 32, 16, 30) as write:
         for shade in (0, 100, 255):
             write(np.full((16, 32, 3), shade, np.uint8))
     file.seek(0)
@@ -76,7 +76,7 @@ def test_what_is_written_is_h264_and_keeps_its_grey_levels() -> None:
     assert np.allclose(shades, (0, 100, 255), atol=1.5)
 
 
-def test_smaller_pictures_are_averaged_not_sampled(tmp_path: Path) -> None:
+def test_smaller_pictures_are_area_averaged(tmp_path: Path) -> None:
     stripes = np.zeros((3, HEIGHT, WIDTH), np.uint8)
     stripes[:, :, ::2] = 200
     for frame in read(encode(tmp_path / "a.mp4", stripes, preset="veryslow"), WIDTH // 4, HEIGHT // 4):
@@ -84,8 +84,8 @@ def test_smaller_pictures_are_averaged_not_sampled(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("turn", "corner"), [((0, 1, -1, 0), "top right"), ((-1, 0, 0, -1), "bottom right")])
-def test_a_phone_held_upright_is_turned_upright(tmp_path: Path, turn: tuple[int, int, int, int], corner: str) -> None:
-    """Players obey the matrix in the track's header; a bright top left corner then shows elsewhere."""
+def test_rotated_pictures_are_turned_upright(tmp_path: Path, turn: tuple[int, int, int, int], corner: str) -> None:
+    """The matrix in the track's header, which players apply, moves a bright top left corner elsewhere."""
     bright = np.zeros((4, HEIGHT, WIDTH), np.uint8)
     bright[:, : HEIGHT // 2, : WIDTH // 2] = 220
     path = encode(tmp_path / "a.mp4", bright)
@@ -96,8 +96,8 @@ def test_a_phone_held_upright_is_turned_upright(tmp_path: Path, turn: tuple[int,
     content = path.read_bytes()
     at = content.index(matrix(1, 0, 0, 1), content.index(b"tkhd"))
     path.write_bytes(content[:at] + matrix(*turn) + content[at + 36 :])
-    with video_io.reading(path) as film:
-        frames = list(film.frames(film.width, film.height))
+    with video_io.open_reader(path) as video:
+        frames = list(video.frames(video.width, video.height))
     rows, columns = frames[0].picture.shape
     assert (columns, rows) == ((HEIGHT, WIDTH) if turn[0] == 0 else (WIDTH, HEIGHT))
     halves = {"top": slice(0, rows // 2), "bottom": slice(rows // 2, rows)}
@@ -111,12 +111,12 @@ def test_a_phone_held_upright_is_turned_upright(tmp_path: Path, turn: tuple[int,
     ("name", "options"), [("a.mp4", {}), ("a.mp4", {"movflags": "faststart"}), ("a.mkv", {}), ("a.avi", {})]
 )
 def test_a_truncated_video_is_refused(tmp_path: Path, name: str, options: dict[str, str]) -> None:
-    path = cut(encode(tmp_path / name, pictures(), **options), 0.6)
+    path = truncate(encode(tmp_path / name, pictures(), **options), 0.6)
     with pytest.raises(InputError, match=r"^expected .*video.* got .*; (get the whole file|try to play it)$"):
         read(path)
 
 
-def test_sound_that_goes_on_after_the_pictures_is_no_damage(tmp_path: Path) -> None:
+def test_sound_longer_than_the_pictures_is_no_damage(tmp_path: Path) -> None:
     with av.open(str(tmp_path / "a.mkv"), "w") as container:
         stream, sound = container.add_stream("h264", rate=30), container.add_stream("aac", rate=8000)
         assert isinstance(stream, av.VideoStream) and isinstance(sound, av.AudioStream)
@@ -132,7 +132,7 @@ def test_sound_that_goes_on_after_the_pictures_is_no_damage(tmp_path: Path) -> N
     assert len(read(tmp_path / "a.mkv")) == 10
 
 
-def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
+def test_files_without_video_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("hello " * 1000)
     (tmp_path / "empty.mp4").touch()
     with wave.open(str(tmp_path / "sound.wav"), "wb") as sound:
@@ -150,7 +150,7 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_odd_sizes_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="even width"), video_io.writing(tmp_path / "a.mp4", 33, 16, 30):
+def test_odd_sizes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="even width"), video_io.open_writer(tmp_path / "a.mp4", 33, 16, 30):
         pass
     assert not (tmp_path / "a.mp4").exists()

@@ -1,4 +1,4 @@
-"""The film and the view from outside: the robot is where it was, always in sight, and the file plays."""
+"""The video of a walk and the third-person view: positions of robot and eyes, visibility, and the file."""
 
 import io
 from collections.abc import Callable
@@ -16,71 +16,73 @@ import synthetic
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import third_person, walk_video
 from lgmdjax.sensors import camera
+from lgmdjax.simulation import assembly
+from lgmdjax.simulation.closed_loop import Room
 from lgmdjax.world import arena
 
-EYES = camera.Params(width=80, height=60)
-SMALL = third_person.Params(width=160, height=100, focal=125.0, rows=(30, 100), columns=(38, 122))
+EYES = camera.Params(width=80, height=60, overlap=0.6)
+SMALL = third_person.Params(width=160, height=100, focal=125.0, robot_rows=(30, 100), robot_columns=(38, 122))
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory) -> walk_video.Walk:
+def walk(tmp_path_factory: pytest.TempPathFactory) -> walk_video.WalkTrace:
     run = synthetic.write_run(tmp_path_factory.mktemp("runs") / "made-up", frames=300, pixels=(60, 80))
     recorded = np.load(run / "evaluate/walk.npz")
-    return walk_video.Walk(*(recorded[name] for name in walk_video.Walk._fields))
+    return walk_video.WalkTrace(*(recorded[name] for name in walk_video.WalkTrace._fields))
 
 
 @pytest.fixture(scope="module")
-def decoded(walk: walk_video.Walk) -> tuple[list[np.ndarray], float]:
-    """The film of one second and its rate."""
+def decoded(walk: walk_video.WalkTrace) -> tuple[list[np.ndarray], float]:
+    """Images of a video of one second, and its rate."""
     buffer = io.BytesIO()
-    assert walk_video.write(buffer, walk, synthetic.room(), EYES, seconds=1.0, overlap=0.6) == 12
+    assert walk_video.write_trace(buffer, walk, synthetic.room(), EYES, seconds=1.0) == 12
     buffer.seek(0)
     with av.open(buffer, "r") as container:
         stream = container.streams.video[0]
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)], float(stream.average_rate or 0)
 
 
-def test_film_has_its_pictures_size_and_rate(decoded: tuple[list[np.ndarray], float]):
-    pictures, rate = decoded
-    assert len(pictures) == 12
-    assert {picture.shape for picture in pictures} == {(600, 960, 3)}
+def test_the_video_has_the_right_number_size_and_rate_of_images(decoded: tuple[list[np.ndarray], float]):
+    images, rate = decoded
+    assert len(images) == 12
+    assert {image.shape for image in images} == {(600, 960, 3)}
     assert rate == pytest.approx(12)
 
 
-def test_curves_run_with_the_film(decoded: tuple[list[np.ndarray], float]):
-    def ink(picture: np.ndarray) -> int:
-        """Pixels of coloured curve in the lower panels."""
-        x, y, width, _ = walk_video.CURVES[0]
-        below = picture[y : walk_video.CURVES[1][1] + walk_video.CURVES[1][3], x : x + width].astype(int)
-        return int(np.sum(np.ptp(below, axis=-1) > 60))
+def test_curves_grow_during_the_video(decoded: tuple[list[np.ndarray], float]):
+    def coloured_pixels(image: np.ndarray) -> int:
+        """Count the coloured pixels of the curves."""
+        x, y, width, _ = walk_video.CURVE_BOXES[0]
+        curves = image[y : walk_video.CURVE_BOXES[1][1] + walk_video.CURVE_BOXES[1][3], x : x + width].astype(int)
+        return int(np.sum(np.ptp(curves, axis=-1) > 60))
 
-    drawn = [ink(picture) for picture in decoded[0]]
-    assert drawn[0] < 0.1 * drawn[-1]
-    assert np.mean(np.diff(drawn) >= 0) > 0.8
-
-
-def test_the_robot_moves_in_the_film(decoded: tuple[list[np.ndarray], float]):
-    x, y, width, height = walk_video.STAGE
-    stage = [picture[y : y + height, x : x + width].astype(int) for picture in decoded[0]]
-    assert all(np.abs(a - b).max() > 60 for a, b in pairwise(stage))
+    counts = [coloured_pixels(image) for image in decoded[0]]
+    assert counts[0] < 0.1 * counts[-1]
+    assert np.mean(np.diff(counts) >= 0) > 0.8
 
 
-def test_what_the_detector_does_not_see_is_dimmed(walk: walk_video.Walk):
+def test_the_robot_moves_in_the_video(decoded: tuple[list[np.ndarray], float]):
+    x, y, width, height = walk_video.VIEW_BOX
+    views = [image[y : y + height, x : x + width].astype(int) for image in decoded[0]]
+    assert all(np.abs(a - b).max() > 60 for a, b in pairwise(views))
+
+
+def test_the_image_is_dimmed_outside_the_hemifield(walk: walk_video.WalkTrace):
     white = np.full((2, 60, 80), 250, np.uint8)
-    page = walk_video._Paper(walk, np.arange(60), (80, 60)).picture(
+    page = walk_video._Page(walk, np.arange(60), (80, 60)).compose(
         np.zeros((100, 160, 3), np.uint8), white, 0, overlap=0.6
     )
-    for (x, y, width, _), first, last in zip(walk_video.EYES, (0.0, 0.4), (0.6, 1.0), strict=True):
+    for (x, y, width, _), first, last in zip(walk_video.EYE_BOXES, (0.0, 0.4), (0.6, 1.0), strict=True):
         row, across = page[y + 50, x : x + width, 0], np.arange(width) / width
         assert np.all(row[(across > first + 0.03) & (across < last - 0.03)] == 250)
         np.testing.assert_allclose(
-            row[(across < first - 0.03) | (across > last + 0.03)], 250 * walk_video.DIMMED, atol=1
+            row[(across < first - 0.03) | (across > last + 0.03)], 250 * walk_video.DIMMING, atol=1
         )
 
 
-def test_eyes_are_where_the_trunk_carries_them(walk: walk_video.Walk):
-    _, _, positions, rotations, _, _ = walk_video.bodies(walk_video.poses(walk, np.array([0, 150])))
-    for row, position, rotation in zip((0, 150), positions, rotations, strict=True):
+def test_eyes_are_fixed_to_the_trunk(walk: walk_video.WalkTrace):
+    body = walk_video.body_geometry(walk_video.to_qpos(walk, np.array([0, 150])))
+    for row, position, rotation in zip((0, 150), body.eye_positions, body.eye_rotations, strict=True):
         yaw = 2 * np.arctan2(walk.quaternion[row, 3], walk.quaternion[row, 0])
         forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
         np.testing.assert_allclose(position[0] - position[1], 0.065 * left, atol=1e-9)
@@ -88,102 +90,136 @@ def test_eyes_are_where_the_trunk_carries_them(walk: walk_video.Walk):
         assert (position[0] - walk.position[row]) @ forward > 0.1
 
 
-def test_the_robot_is_always_in_the_window_that_is_cast_for_it(walk: walk_video.Walk):
-    shots, body = walk_video._shots(walk, np.arange(0, 300, 10))
-    view = third_person.Params()
-    for eye, rotation, ends in zip(
-        shots.eye, shots.rotation, jnp.concatenate([shots.starts, shots.ends], 1), strict=True
-    ):
-        seen = (ends - eye) @ rotation
-        column = view.width / 2 - view.focal * seen[:, 1] / seen[:, 0]
-        row = view.height / 2 - view.focal * seen[:, 2] / seen[:, 0]
-        reach = view.focal * float(body.radii.max()) / float(seen[:, 0].min())
-        assert view.columns[0] <= float(column.min()) - reach and float(column.max()) + reach <= view.columns[1]
-        assert view.rows[0] <= float(row.min()) - reach and float(row.max()) + reach <= view.rows[1]
+def test_the_robot_is_always_in_its_window_of_the_image(walk: walk_video.WalkTrace):
+    views, robot = walk_video._views(walk, np.arange(0, 300, 10))
+    params = third_person.Params()
+    ends = jnp.concatenate([views.starts, views.ends], 1)
+    for position, rotation, points in zip(views.camera_position, views.camera_rotation, ends, strict=True):
+        local = (points - position) @ rotation
+        column = params.width / 2 - params.focal * local[:, 1] / local[:, 0]
+        row = params.height / 2 - params.focal * local[:, 2] / local[:, 0]
+        radius = params.focal * float(robot.radii.max()) / float(local[:, 0].min())
+        first, last = params.robot_columns
+        assert first <= float(column.min()) - radius and float(column.max()) + radius <= last
+        first, last = params.robot_rows
+        assert first <= float(row.min()) - radius and float(row.max()) + radius <= last
 
 
 @pytest.fixture(scope="module")
-def look() -> Callable[..., np.ndarray]:
-    """Draw a ball of pure red at (0, 0, 0.1) in a room, from 0.9 m behind and 0.5 m above."""
-    ball = third_person.Body(
+def render_ball() -> Callable[..., np.ndarray]:
+    """Return a function that renders a red ball at (0, 0, 0.1) in a room, from 0.9 m behind and 0.5 m above."""
+    ball = third_person.RobotCapsules(
         starts=jnp.array([[0.0, 0.0, 0.1]]),
         ends=jnp.array([[0.0, 0.0, 0.1]]),
         radii=jnp.array([0.06]),
         colours=jnp.array([[1.0, 0.0, 0.0]]),
     )
-    eye, target = np.array([[-0.9, 0.0, 0.6]]), np.array([[0.0, 0.0, 0.1]])
-    rotation = jnp.asarray(walk_video.looking(eye, target)[0])
-    draw = jax.jit(partial(third_person.picture, SMALL))
+    position, target = np.array([[-0.9, 0.0, 0.6]]), np.array([[0.0, 0.0, 0.1]])
+    rotation = jnp.asarray(walk_video.look_at(position, target)[0])
+    viewpoint = third_person.Viewpoint(jnp.asarray(position[0]), rotation)
+    render_view = jax.jit(partial(third_person.render_view, SMALL))
 
-    def at(room: arena.Arena, shift: float = 0.0) -> np.ndarray:
-        body = ball._replace(starts=ball.starts + jnp.array([shift, 0, 0]), ends=ball.ends + jnp.array([shift, 0, 0]))
-        return np.asarray(draw(room, jnp.asarray(eye[0]), rotation, body, jnp.asarray(target[0])))
+    def render(room: arena.Arena, shift: float = 0.0) -> np.ndarray:
+        robot = ball._replace(starts=ball.starts + jnp.array([shift, 0, 0]), ends=ball.ends + jnp.array([shift, 0, 0]))
+        return np.asarray(render_view(room, viewpoint, robot, jnp.asarray(target[0])))
 
-    return at
-
-
-def red(picture: np.ndarray) -> np.ndarray:
-    return picture[..., 0] > 2 * np.maximum(picture[..., 1], picture[..., 2])
+    return render
 
 
-def test_a_ball_is_a_disc_in_the_middle_lit_from_above(look: Callable[..., np.ndarray]):
-    picture = look(arena.empty_room())
-    rows, columns = np.nonzero(red(picture))
+def is_red(image: np.ndarray) -> np.ndarray:
+    return image[..., 0] > 2 * np.maximum(image[..., 1], image[..., 2])
+
+
+def test_a_ball_is_rendered_as_a_disc_in_the_middle_lit_from_above(render_ball: Callable[..., np.ndarray]):
+    picture = render_ball(arena.empty_room())
+    rows, columns = np.nonzero(is_red(picture))
     assert (rows.mean(), columns.mean()) == pytest.approx((49.5, 79.5), abs=2)
-    # Seen under asin(0.06 / 1.03), times the focal length: 7.3 px of radius.
+    # The ball subtends asin(0.06 / 1.03), which times the focal length is a radius of 7.3 px.
     assert len(rows) == pytest.approx(np.pi * 7.3**2, rel=0.12)
     assert picture[rows.min() + 2, 80, 0] > 1.3 * picture[rows.max() - 2, 80, 0]
 
 
-def test_a_ball_throws_its_shadow_on_the_floor(look: Callable[..., np.ndarray]):
+def test_a_ball_casts_a_shadow_on_the_floor(render_ball: Callable[..., np.ndarray]):
     room = arena.empty_room(floor_texture=(150.0, 0.0, 0.0, 0.5))
-    near, far = look(room), look(room, shift=5.0)
-    darker = (far - near).mean(axis=-1) * ~red(near)
+    near, far = render_ball(room), render_ball(room, shift=5.0)
+    darker = (far - near).mean(axis=-1) * ~is_red(near)
     rows, columns = np.nonzero(darker > 0.02)
     assert len(rows) > 20
     assert columns.mean() == pytest.approx(79.5, abs=2)
-    assert rows.mean() > 50, "straight below the ball is lower in the picture"
+    assert rows.mean() > 50, "the floor below the ball is lower in the image"
 
 
-def test_what_stands_in_front_turns_to_glass_and_what_stands_behind_does_not(look: Callable[..., np.ndarray]):
-    empty = look(arena.empty_room())
-    front = look(arena.empty_room(boxes=arena.place([[-0.4, 0.0]], [[0.05, 0.4]], 0.9)))
-    behind = look(arena.empty_room(boxes=arena.place([[0.3, 0.0]], [[0.05, 0.4]], 0.9)))
-    assert np.sum(red(front)) > 0.9 * np.sum(red(empty))
-    assert np.abs(front - empty)[45:55, 60:100].mean() > 0.02, "glass can be seen"
-    assert np.median(np.abs(behind - empty)[red(empty)]) < 1e-6, "the ball hides what is behind it"
+def test_a_box_in_front_becomes_transparent_and_a_box_behind_does_not(render_ball: Callable[..., np.ndarray]):
+    empty = render_ball(arena.empty_room())
+    front = render_ball(arena.empty_room(boxes=arena.make_prisms([[-0.4, 0.0]], [[0.05, 0.4]], 0.9)))
+    behind = render_ball(arena.empty_room(boxes=arena.make_prisms([[0.3, 0.0]], [[0.05, 0.4]], 0.9)))
+    assert np.sum(is_red(front)) > 0.9 * np.sum(is_red(empty))
+    assert np.abs(front - empty)[45:55, 60:100].mean() > 0.02, "the transparent box is visible"
+    assert np.median(np.abs(behind - empty)[is_red(empty)]) < 1e-6, "the ball hides the box behind it"
     assert np.abs(behind - empty).max() > 0.1
 
 
-def test_surfaces_are_shaded_by_where_they_face(look: Callable[..., np.ndarray]):
-    """A plain grey box: its top, which faces the light, is brighter than the face towards the camera."""
+def test_surfaces_are_shaded_by_their_orientation(render_ball: Callable[..., np.ndarray]):
+    """The top of a plain grey box, which faces the light, is brighter than the face towards the camera."""
     plain = (128.0, 0.0, 0.0, 0.5)
-    picture = look(arena.empty_room(boxes=arena.place([[0.9, 0.0]], [[0.2, 0.4]], 0.4, texture=plain)), shift=5.0)
+    picture = render_ball(
+        arena.empty_room(boxes=arena.make_prisms([[0.9, 0.0]], [[0.2, 0.4]], 0.4, texture=plain)), shift=5.0
+    )
     box = (picture[..., 2] > 1.1 * picture[..., 0])[:, 80]  # boxes are tinted blue
     rows = np.flatnonzero(box)
     assert picture[rows[1], 80].mean() > 1.2 * picture[rows[-3], 80].mean()
 
 
-def test_the_stretch_with_steering_is_chosen_and_set_backs_are_avoided(walk: walk_video.Walk):
+def test_the_segment_with_most_turning_is_selected_and_resets_are_avoided(walk: walk_video.WalkTrace):
     frames = len(walk.time)
     velocity = np.full((frames, 2), 1.2)
     velocity[60:90] = (2.0, -1.0)
     velocity[180:240] = (2.0, -1.0)
     position = np.cumsum(np.full((frames, 3), [0.002, 0, 0]), axis=0)
-    assert walk_video.choose(walk._replace(velocity=velocity, position=position), 60)[0] in range(165, 196)
+    assert walk_video.select_segment(walk._replace(velocity=velocity, position=position), 60)[0] in range(165, 196)
     position[210:] += 3.0
-    chosen = walk_video.choose(walk._replace(velocity=velocity, position=position), 60)
-    assert np.all(np.diff(chosen) == 1)
-    assert 60 in chosen and 89 in chosen
-    assert walk_video.choose(walk, 10_000).tolist() == list(range(frames))
+    selected = walk_video.select_segment(walk._replace(velocity=velocity, position=position), 60)
+    assert np.all(np.diff(selected) == 1)
+    assert 60 in selected and 89 in selected
+    assert walk_video.select_segment(walk, 10_000).tolist() == list(range(frames))
 
 
-def test_a_walk_that_does_not_fit_is_refused(walk: walk_video.Walk, tmp_path: Path):
+def test_a_trace_with_wrong_shapes_or_numbers_is_refused(walk: walk_video.WalkTrace, tmp_path: Path):
     for bad in (
         walk._replace(joints=walk.joints[:, :5]),
         walk._replace(u=walk.u * np.nan),
-        walk_video.Walk(*(series[:0] for series in walk)),
+        walk_video.WalkTrace(*(series[:0] for series in walk)),
     ):
         with pytest.raises(InputError, match="expected a walk"):
-            walk_video.write(tmp_path / "walk.mp4", bad, synthetic.room(), EYES)
+            walk_video.write_trace(tmp_path / "walk.mp4", bad, synthetic.room(), EYES)
     assert not (tmp_path / "walk.mp4").exists()
+
+
+def test_the_most_eventful_walk_has_most_turning_among_those_with_fewest_collisions():
+    velocity = np.zeros((4, 300, 2))
+    velocity[..., 1] = np.array([3.0, 1.0, 2.0, 4.0])[:, None]
+    contact, ok = np.zeros((4, 300), bool), np.ones((4, 300), bool)
+    contact[0, 10], ok[3, 200:] = True, False
+    assert walk_video.most_eventful(synthetic.walk(4, 300, velocity=velocity, contact=contact, ok=ok)) == 2
+
+
+def test_a_video_of_a_record_shows_one_walk_in_its_own_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    written = []
+    monkeypatch.setattr(walk_video, "write_trace", lambda *arguments: written.append(arguments))
+    velocity = np.zeros((2, 300, 2))
+    velocity[1, :, 0] = 1.0
+    record = synthetic.walk(2, 300, velocity=velocity)
+    arenas = jax.tree.map(lambda *leaves: jnp.stack(leaves), synthetic.room(), arena.mirror(synthetic.room()))
+    rooms = Room(arena=arenas, starts=jnp.zeros((2, 1, 3)), key=jax.random.split(jax.random.key(0), 2))
+    robot = assembly.load_robot()
+    assert walk_video.write_video(tmp_path / "walk.mp4", record, rooms) == tmp_path / "walk.mp4"
+    walk_video.write_video(tmp_path / "walk.mp4", record, synthetic.room(), robot, index=0, seconds=3.0)
+    walk_video.write_video(tmp_path / "walk.mp4", jax.tree.map(lambda leaf: leaf[0], record), synthetic.room(), robot)
+    (_, trace, mirrored, eyes, _), (_, first, room, _, seconds), (_, single, *_) = written
+    np.testing.assert_array_equal(trace.velocity, velocity[1])
+    assert float(mirrored.handedness) == -1 and float(room.handedness) == 1
+    assert eyes == robot.camera and seconds == 3.0
+    for name, series in first._asdict().items():
+        np.testing.assert_array_equal(series, getattr(single, name))
+    with pytest.raises(InputError, match="expected an index of one of 2 walks, got 2"):
+        walk_video.write_video(tmp_path / "walk.mp4", record, rooms, robot, index=2)

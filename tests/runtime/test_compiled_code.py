@@ -1,4 +1,4 @@
-"""Programs are let go of when they fill much of what a process may map, and not before."""
+"""Compiled programs are released when a process has used much of its memory mappings, and not before."""
 
 from typing import Any
 
@@ -10,21 +10,21 @@ from lgmdjax.runtime import compiled_code
 
 @pytest.fixture
 def program():
-    """A program that is compiled."""
+    """A compiled program."""
     double: Any = jax.jit(lambda x: 2 * x)
     double(1.0)
     assert double._cache_size() == 1
     return double
 
 
-@pytest.mark.skipif(not compiled_code.ALLOWED.exists(), reason="only Linux has a bound")
-@pytest.mark.parametrize(("share", "left"), [(0.0, 0), (1.0, 1)])
-def test_lets_go_of_programs_above_a_share_of_what_is_allowed(program, share, left):
-    compiled_code.let_go(share)
+@pytest.mark.skipif(not compiled_code.LIMIT_FILE.exists(), reason="only Linux has a limit")
+@pytest.mark.parametrize(("fraction", "left"), [(0.0, 0), (1.0, 1)])
+def test_clears_programs_above_a_fraction_of_the_limit(program, fraction, left):
+    compiled_code.clear_caches_if_crowded(fraction)
     assert program._cache_size() == left
 
 
-def test_lets_go_of_nothing_where_there_is_no_bound(program, monkeypatch, tmp_path):
-    monkeypatch.setattr(compiled_code, "ALLOWED", tmp_path / "none")
-    compiled_code.let_go(0.0)
+def test_clears_nothing_on_systems_without_a_limit(program, monkeypatch, tmp_path):
+    monkeypatch.setattr(compiled_code, "LIMIT_FILE", tmp_path / "none")
+    compiled_code.clear_caches_if_crowded(0.0)
     assert program._cache_size() == 1

@@ -1,4 +1,4 @@
-"""Stages run once, again when what they are made from changes, and never leave half a result."""
+"""Stages run once, run again when something they depend on changes, and never leave half a result."""
 
 import json
 import os
@@ -10,12 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import lgmdjax
 from lgmdjax.errors import InputError
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import run_folders
 from lgmdjax.runtime.run_folders import Run, Stage, execute, open_run
 
 
@@ -27,7 +26,7 @@ class Number:
 
 @dataclass
 class Pipeline:
-    """Two numbers and their sum; writes down what ran."""
+    """Two numbers and their sum; lists the stages that ran."""
 
     ran: list[str] = field(default_factory=list)
     interrupt: bool = False
@@ -41,7 +40,7 @@ class Pipeline:
         values = [int((inputs[name] / "value.txt").read_text()) for name in ("left", "right")]
         first = folder / "first" / "half.txt"
         if first.exists():
-            self.ran.append("carried on")
+            self.ran.append("resumed")
         else:
             first.parent.mkdir()
             first.write_text(str(values[0]))
@@ -52,9 +51,9 @@ class Pipeline:
     @property
     def stages(self) -> tuple[Stage, ...]:
         return (
-            Stage(name="left", work=self.number),
-            Stage(name="right", work=self.number),
-            Stage(name="total", work=self.total, inputs=("left", "right")),
+            Stage(name="left", run=self.number),
+            Stage(name="right", run=self.number),
+            Stage(name="total", run=self.total, inputs=("left", "right")),
         )
 
     def execute(self, run: Run, target: str = "total") -> list[str]:
@@ -76,11 +75,11 @@ def run(tmp_path: Path) -> Run:
     return open_run(tmp_path, "try", "smoke", 5, SETTINGS)
 
 
-def test_a_finished_run_has_nothing_to_do(pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_finished_run_is_up_to_date(pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert pipeline.execute(run) == ["left", "right", "total"]
     assert (run.folder / "total" / "value.txt").read_text() == "21"
-    began = capsys.readouterr().out
-    assert all(word in began for word in ("total: starts on 2 x cpu", "seed 5", str(run.folder), "jax"))
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("total: starts on 2 x cpu", "seed 5", str(run.folder), "jax"))
     assert pipeline.execute(run) == []
     assert capsys.readouterr().out.count("up to date") == 3
 
@@ -90,7 +89,7 @@ def test_one_stage_runs_alone(pipeline: Pipeline, run: Run) -> None:
     assert not (run.folder / "left").exists()
 
 
-def test_a_changed_setting_runs_what_depends_on_it_and_no_more(pipeline: Pipeline, run: Run) -> None:
+def test_a_changed_setting_runs_the_stages_that_depend_on_it(pipeline: Pipeline, run: Run) -> None:
     pipeline.execute(run)
     changed = replace(run, settings=SETTINGS | {"left": Number(2)})
     assert pipeline.execute(changed) == ["left", "total"]
@@ -109,7 +108,7 @@ def test_another_version_of_a_stage_runs_it(pipeline: Pipeline, run: Run) -> Non
 
 
 @pytest.mark.parametrize("damage", ["lost", "cut", "stamp"])
-def test_a_damaged_stage_is_done_again(pipeline: Pipeline, run: Run, damage: str) -> None:
+def test_a_damaged_stage_runs_again(pipeline: Pipeline, run: Run, damage: str) -> None:
     pipeline.execute(run)
     if damage == "stamp":
         (run.folder / "right" / "done.json").write_text('{"fingerpr')
@@ -121,13 +120,13 @@ def test_a_damaged_stage_is_done_again(pipeline: Pipeline, run: Run, damage: str
     assert (run.folder / "right" / "value.txt").read_text() == "15"
 
 
-def test_a_file_that_the_user_adds_is_no_damage(pipeline: Pipeline, run: Run) -> None:
+def test_a_stage_with_additional_files_is_up_to_date(pipeline: Pipeline, run: Run) -> None:
     pipeline.execute(run)
     (run.folder / "total" / "my notes.txt").write_text("fine")
     assert pipeline.execute(run) == []
 
 
-def test_an_interrupted_stage_leaves_nothing_and_carries_on(
+def test_an_interrupted_stage_leaves_no_result_and_resumes(
     pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pipeline.interrupt = True
@@ -135,13 +134,16 @@ def test_an_interrupted_stage_leaves_nothing_and_carries_on(
         pipeline.execute(run)
     assert not (run.folder / "total").exists()
     capsys.readouterr()
-    assert pipeline.execute(run) == ["total", "carried on"]
-    assert "total: carries on" in capsys.readouterr().out
+    (partial,) = run.folder.glob("total.partial-*")
+    (partial / "first" / "half.txt.123.partial").write_text("of a process that was killed")
+    assert pipeline.execute(run) == ["total", "resumed"]
+    assert "total: resumes" in capsys.readouterr().out
     assert (run.folder / "total" / "value.txt").read_text() == "21"
     assert sorted(p.name for p in run.folder.iterdir()) == [".lock", "left", "right", "run.json", "total"]
+    assert [p.name for p in (run.folder / "total" / "first").iterdir()] == ["half.txt"]
 
 
-def test_an_interrupted_try_with_other_inputs_is_not_carried_on(pipeline: Pipeline, run: Run) -> None:
+def test_an_interrupted_stage_is_not_resumed_with_other_inputs(pipeline: Pipeline, run: Run) -> None:
     pipeline.interrupt = True
     with pytest.raises(KeyboardInterrupt):
         pipeline.execute(run)
@@ -151,7 +153,7 @@ def test_an_interrupted_try_with_other_inputs_is_not_carried_on(pipeline: Pipeli
     assert not list(run.folder.glob("*.partial-*"))
 
 
-def test_a_failed_redo_keeps_the_result_that_was_there(pipeline: Pipeline, run: Run) -> None:
+def test_a_stage_that_fails_keeps_its_last_result(pipeline: Pipeline, run: Run) -> None:
     pipeline.execute(run)
     pipeline.interrupt = True
     with pytest.raises(KeyboardInterrupt):
@@ -159,12 +161,12 @@ def test_a_failed_redo_keeps_the_result_that_was_there(pipeline: Pipeline, run: 
     assert (run.folder / "total" / "value.txt").read_text() == "21"
 
 
-def test_a_kill_at_any_moment_can_be_carried_on_from(tmp_path: Path) -> None:
-    """Kill the process in the stage, and then once more between its last file and the move into place."""
+def test_a_killed_run_can_be_resumed(tmp_path: Path) -> None:
+    """Kill the process inside the stage, and then again between its last file and the move into place."""
     script = textwrap.dedent("""
         import os, signal, sys
         from pathlib import Path
-        from lgmdjax import runs
+        from lgmdjax.runtime import run_folders
         def work(folder, inputs, settings, seed):
             if not (folder / "a").exists():
                 (folder / "a").write_text("a")
@@ -175,8 +177,9 @@ def test_a_kill_at_any_moment_can_be_carried_on_from(tmp_path: Path) -> None:
         if sys.argv[2] == "die":
             move = os.replace
             os.replace = lambda source, to: die() if str(to).endswith("stage") else move(source, to)
-        run = runs.open_run(Path(sys.argv[1]), "try", "smoke", 0, {"stage": 1})
-        print(runs.execute(run, [runs.Stage(name="stage", work=work)], "stage"))
+        run = run_folders.open_run(Path(sys.argv[1]), "try", "smoke", 0, {"stage": 1})
+        stage = run_folders.Stage(name="stage", run=work)
+        print(run_folders.execute(run, [stage], "stage"))
     """)
     (tmp_path / "script.py").write_text(script)
     stage = tmp_path / "try" / "stage"
@@ -201,19 +204,30 @@ def test_other_settings_are_refused(tmp_path: Path, run: Run) -> None:
         ("quick", 5, SETTINGS, "scale = quick"),
         ("smoke", 6, SETTINGS, "seed = 6"),
         ("smoke", 5, SETTINGS | {"left": Number(3)}, "settings.left.value = 3"),
+        ("smoke", 5, SETTINGS | {"left": Number(1, (1, 3))}, "settings.left.parts.1 = 3"),
     ]:
         with pytest.raises(InputError, match=f"expected .*{named}, got .* made with .*; choose"):
             open_run(tmp_path, "try", scale, seed, settings)
     assert open_run(tmp_path, "try", "smoke", 5, SETTINGS) == run
 
 
-def test_the_settings_are_written_down(run: Run) -> None:
+def test_settings_are_recorded(run: Run) -> None:
     made = json.loads((run.folder / "run.json").read_text())
     assert made["settings"]["left"] == {"value": 1, "parts": [1, 2]}
     assert made["seed"] == 5 and made["scale"] == "smoke" and "jax" in made["versions"]
 
 
-@pytest.mark.parametrize("content", ["", '{"format": 1', "[]", '{"format": 1}'])
+@pytest.mark.parametrize(("change", "maker"), [(-1, "older"), (1, "newer")])
+def test_a_folder_of_another_format_is_refused(tmp_path: Path, run: Run, change: int, maker: str) -> None:
+    path = run.folder / "run.json"
+    made = json.loads(path.read_text())
+    path.write_text(json.dumps({"format": run_folders.FORMAT + change, "scale": made["scale"]}))
+    with pytest.raises(InputError, match=f"made by an? {maker} lgmdjax; .*--run; choose another --name") as caught:
+        open_run(tmp_path, "try", "smoke", 5, SETTINGS)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", ["", '{"format": 2', "[]", '{"format": 2}', '{"format": "two"}', "{}"])
 def test_unreadable_settings_are_refused(tmp_path: Path, run: Run, content: str) -> None:
     (run.folder / "run.json").write_text(content)
     with pytest.raises(InputError, match=r"run\.json.*cannot be read"):
@@ -233,29 +247,31 @@ def test_a_name_with_a_path_in_it_is_refused(tmp_path: Path, name: str) -> None:
         open_run(tmp_path, name, "smoke", 0, SETTINGS)
 
 
-def test_two_processes_do_not_share_a_run_folder(run: Run) -> None:
-    nested: list[str] = []
+def test_a_run_folder_is_locked_while_stages_run(run: Run) -> None:
+    refusals: list[str] = []
 
     def work(folder: Path, inputs: Mapping[str, Path], settings: Number, seed: int) -> None:
-        with pytest.raises(InputError, match="a run at work in it") as caught:
-            execute(run, [Stage(name="right", work=work)], "right")
-        nested.append(str(caught.value))
+        with pytest.raises(InputError, match="another process runs stages") as caught:
+            execute(run, [Stage(name="right", run=work)], "right")
+        refusals.append(str(caught.value))
 
-    execute(run, [Stage(name="left", work=work)], "left")
-    assert len(nested) == 1
+    execute(run, [Stage(name="left", run=work)], "left")
+    assert len(refusals) == 1
 
 
-def test_damaged_files_of_a_stage_are_named(tmp_path: Path) -> None:
-    stage = tmp_path / "collect"
-    stage.mkdir()
-    (stage / "a.json").write_text('{"threshold": ')
-    np.savez(stage / "b.npz", gain=1.0)
-    assert storage.read_arrays(stage / "b.npz")["gain"] == 1.0
-    (stage / "b.npz").write_bytes((stage / "b.npz").read_bytes()[:-20])
-    for read, name, found in (
-        (storage.read_json, "a.json", "cannot be read"),
-        (storage.read_arrays, "b.npz", "cannot be read"),
-        (storage.read_json, "none.json", "none"),
-    ):
-        with pytest.raises(InputError, match=f"expected .*{name}.*{found}.*`lgmdjax collect`"):
-            read(stage / name)
+def test_a_run_folder_is_locked_for_other_processes(run: Run) -> None:
+    script = textwrap.dedent("""
+        import sys
+        from pathlib import Path
+        from lgmdjax.runtime.run_folders import Run, Stage, execute
+        execute(Run(folder=Path(sys.argv[1]), seed=5, settings={"right": 1}), [Stage(name="right", run=print)], "right")
+    """)
+
+    def work(folder: Path, inputs: Mapping[str, Path], settings: Number, seed: int) -> None:
+        command = [sys.executable, "-c", script, str(run.folder)]
+        other = subprocess.run(command, capture_output=True, text=True)
+        (folder / "stderr").write_text(other.stderr)
+
+    folder = execute(run, [Stage(name="left", run=work)], "left")
+    assert "another process runs stages" in (folder / "stderr").read_text()
+    assert not list(run.folder.glob("right*"))

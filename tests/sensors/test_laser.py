@@ -1,4 +1,4 @@
-"""The scanner: which way its rays go, how far, and whose side they count for."""
+"""The laser scanner: bearings, ranges, and the distances of both hemifields."""
 
 import math
 from functools import partial
@@ -17,20 +17,20 @@ PARAMS = laser.Params()
 scan = jax.jit(partial(laser.scan, PARAMS))
 
 
-def turned(yaw: float = 0.0, pitch: float = 0.0) -> np.ndarray:
-    """Rotation of a site: yaw, then pitch with the nose down for positive angles."""
+def rotation_of(yaw: float = 0.0, pitch: float = 0.0) -> np.ndarray:
+    """Return a rotation by yaw, then by pitch with the nose down."""
     c, s, p, q = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ np.array([[p, 0, q], [0, 1, 0], [-q, 0, p]])
 
 
-def test_two_rays_a_degree_from_right_to_left() -> None:
+def test_bearings_are_two_per_degree_from_right_to_left() -> None:
     bearings = np.rad2deg(laser.bearings(PARAMS))
     assert len(bearings) == 341
     np.testing.assert_allclose([bearings[0], bearings[170], bearings[-1]], [-85.0, 0.0, 85.0], atol=1e-12)
     np.testing.assert_allclose(np.diff(bearings), 0.5, atol=1e-12)
 
 
-def test_an_empty_room_is_measured_as_trigonometry_has_it() -> None:
+def test_ranges_in_an_empty_room_equal_trigonometry() -> None:
     """From the middle of 8 x 6 m: walls at 4 m ahead and 3 m aside."""
     room = arena.empty_room((8.0, 6.0))
     phi = np.deg2rad(np.linspace(-85.0, 85.0, 341))
@@ -38,9 +38,9 @@ def test_an_empty_room_is_measured_as_trigonometry_has_it() -> None:
     np.testing.assert_allclose(scan(room, jnp.asarray([0.0, 0.0, 0.2]), np.eye(3)), expected, atol=1e-9)
 
 
-def test_a_turned_and_pitched_scanner_sees_what_mujoco_sees() -> None:
+def test_ranges_of_a_turned_and_pitched_scanner_equal_mujoco() -> None:
     room = scenes.testing_room()
-    position, rotation = np.array([0.4, 1.7, 0.16]), turned(yaw=-1.9, pitch=0.05)
+    position, rotation = np.array([0.4, 1.7, 0.16]), rotation_of(yaw=-1.9, pitch=0.05)
     phi = np.deg2rad(np.linspace(-85.0, 85.0, 341))
     directions = np.stack([np.cos(phi), np.sin(phi), 0 * phi], axis=-1) @ rotation.T
     model, data = reference.load(reference.to_mjcf(room))
@@ -49,57 +49,57 @@ def test_a_turned_and_pitched_scanner_sees_what_mujoco_sees() -> None:
     np.testing.assert_allclose(scan(room, position, rotation), expected, atol=1e-6)
 
 
-def test_far_things_are_clipped() -> None:
+def test_ranges_are_limited() -> None:
     ranges = scan(arena.empty_room((20.0, 20.0)), jnp.asarray([0.0, 0.0, 0.2]), np.eye(3))
     np.testing.assert_array_equal(ranges, 5.0)
 
 
-def test_a_scanner_with_its_nose_down_sees_the_floor() -> None:
-    ranges = scan(arena.empty_room((20.0, 20.0)), jnp.asarray([0.0, 0.0, 0.2]), turned(pitch=0.1))
+def test_a_scanner_pitched_down_measures_the_floor() -> None:
+    ranges = scan(arena.empty_room((20.0, 20.0)), jnp.asarray([0.0, 0.0, 0.2]), rotation_of(pitch=0.1))
     assert float(ranges[170]) == pytest.approx(0.2 / math.sin(0.1))
 
 
 @pytest.mark.parametrize(("side", "near", "far"), [(1.0, 0, 1), (-1.0, 1, 0)])
-def test_a_thing_on_one_side_counts_for_that_side(side: float, near: int, far: int) -> None:
-    room = arena.empty_room((8.0, 8.0), cylinders=arena.place([[1.0, 0.8 * side]], 0.2, 1.0))
-    distances = laser.hemifields(scan(room, jnp.asarray([0.0, 0.0, 0.2]), np.eye(3)))
-    # No ray need meet the point that is nearest, but one passes within a quarter of a degree.
+def test_an_obstacle_on_one_side_counts_for_that_side(side: float, near: int, far: int) -> None:
+    room = arena.empty_room((8.0, 8.0), cylinders=arena.make_prisms([[1.0, 0.8 * side]], 0.2, 1.0))
+    distances = laser.hemifield_distances(scan(room, jnp.asarray([0.0, 0.0, 0.2]), np.eye(3)))
+    # The nearest point need not be on a ray, but a ray passes within a quarter of a degree of it.
     assert float(distances[near]) == pytest.approx(math.hypot(1.0, 0.8) - 0.2, abs=1e-4)
     assert float(distances[far]) == pytest.approx(4.0 / math.cos(0.0), abs=1e-3)
 
 
 def test_the_middle_ray_counts_for_both_sides() -> None:
     ranges = jnp.full(341, 5.0).at[170].set(1.0)
-    np.testing.assert_array_equal(laser.hemifields(ranges), [1.0, 1.0])
-    np.testing.assert_array_equal(laser.hemifields(ranges.at[171].set(0.5)), [0.5, 1.0])
-    np.testing.assert_array_equal(laser.hemifields(ranges.at[169].set(0.5)), [1.0, 0.5])
+    np.testing.assert_array_equal(laser.hemifield_distances(ranges), [1.0, 1.0])
+    np.testing.assert_array_equal(laser.hemifield_distances(ranges.at[171].set(0.5)), [0.5, 1.0])
+    np.testing.assert_array_equal(laser.hemifield_distances(ranges.at[169].set(0.5)), [1.0, 0.5])
 
 
-def test_hemifields_keep_a_batch() -> None:
+def test_hemifield_distances_keep_batch_axes() -> None:
     ranges = np.random.default_rng(0).uniform(0.5, 5.0, (7, 3, 341))
     both = np.stack([ranges[..., 170:].min(-1), ranges[..., :171].min(-1)], axis=-1)
-    np.testing.assert_array_equal(laser.hemifields(jnp.asarray(ranges)), both)
+    np.testing.assert_array_equal(laser.hemifield_distances(jnp.asarray(ranges)), both)
 
 
 def test_mirrored_rooms_give_mirrored_scans() -> None:
     room = scenes.training_room()
     position, flip = np.array([0.3, 0.4, 0.2]), np.array([1.0, -1.0, 1.0])
-    ranges = scan(room, position, turned(yaw=0.7))
-    swapped = scan(arena.mirror(room), position * flip, turned(yaw=-0.7))
+    ranges = scan(room, position, rotation_of(yaw=0.7))
+    swapped = scan(arena.mirror(room), position * flip, rotation_of(yaw=-0.7))
     np.testing.assert_allclose(ranges, swapped[::-1], atol=1e-9)
 
 
-def test_the_rule_can_be_differentiated_through_the_scan() -> None:
-    """Backing off from the box ahead lengthens the ray that meets it by as much; clipped rays do not care."""
-    room = arena.empty_room((40.0, 40.0), boxes=arena.place([[1.5, 0.0]], 0.5, 1.0))
-    slope = jax.jit(jax.jacrev(lambda position: laser.scan(PARAMS, room, position, jnp.eye(3))))
-    rows = np.asarray(slope(jnp.asarray([0.0, 0.0, 0.2])))
+def test_gradient_passes_through_the_scan() -> None:
+    """Moving back from a box ahead lengthens the ray to it by the same distance; limited ranges have gradient zero."""
+    room = arena.empty_room((40.0, 40.0), boxes=arena.make_prisms([[1.5, 0.0]], 0.5, 1.0))
+    jacobian = jax.jit(jax.jacrev(lambda position: laser.scan(PARAMS, room, position, jnp.eye(3))))
+    rows = np.asarray(jacobian(jnp.asarray([0.0, 0.0, 0.2])))
     np.testing.assert_allclose(rows[170], [-1.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_array_equal(rows[0], 0.0)
     assert np.isfinite(rows).all()
 
 
-def test_the_scan_follows_the_precision(precision: str, strict: None) -> None:
+def test_runs_in_either_precision(precision: str, strict: None) -> None:
     room = arena.empty_room((4.0, 4.0))
     scan = partial(laser.scan, laser.Params(rays=11))
     ranges = jax.eval_shape(scan, room, jnp.asarray([0.0, 0.0, 0.2]), jnp.eye(3))
@@ -107,8 +107,8 @@ def test_the_scan_follows_the_precision(precision: str, strict: None) -> None:
     assert ranges.shape == (11,)
 
 
-@pytest.mark.parametrize("wrong", [{"rays": 1}, {"field_of_view": 0.0}, {"field_of_view": 7.0}, {"clip": float("nan")}])
-def test_a_scanner_that_sees_nothing_is_refused(wrong):
+@pytest.mark.parametrize("wrong", [{"rays": 1}, {"fov": 0.0}, {"fov": 7.0}, {"max_range": float("nan")}])
+def test_impossible_parameters_are_refused(wrong):
     laser.check(laser.Params())
     with pytest.raises(InputError, match=next(iter(wrong))):
         laser.check(laser.Params(**wrong))

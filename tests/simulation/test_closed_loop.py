@@ -1,4 +1,4 @@
-"""One frame, and walks made of it: mirrored, set back, frozen."""
+"""The closed loop: mirror symmetry, resets, moving obstacles, faults, and rollouts of batches."""
 
 from dataclasses import replace
 
@@ -26,155 +26,163 @@ def model():
 @pytest.fixture(scope="module")
 def params():
     teacher = braitenberg.Params()
-    everyone = policies.Anyone(
-        seat=jnp.asarray(0),
-        drivers=(
+    switch = policies.PolicySwitch(
+        active=jnp.asarray(0),
+        policies=(
             teacher,
             navigator.create(jax.random.key(3)),
-            policies.Blind(velocity=jnp.asarray([1.2, 1.2])),
-            policies.Direct(rule=teacher, gain=jnp.asarray(10.0)),
-            policies.Replay(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0]])),
+            policies.BlindParams(velocity=jnp.asarray([1.2, 1.2])),
+            policies.DirectParams(rule=teacher, gain=jnp.asarray(10.0)),
+            policies.ReplayParams(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0]])),
         ),
     )
-    detector = lgmd.Params(threshold=0.5, suppression=30.0, smooth=True)
-    eyes = camera.Params(width=48, height=36, overlap=0.6)
-    return closed_loop.assemble(everyone, detector=detector, eyes=eyes)
+    return closed_loop.assemble(
+        switch,
+        lgmd_params=lgmd.Params(threshold=0.5, suppression=30.0, smooth=True),
+        camera_params=camera.Params(width=48, height=36, overlap=0.6),
+    )
 
 
 @pytest.fixture(scope="module")
 def room():
-    """A start half a metre from a box that stands to the left; straight ahead it would be a tie, which has a side."""
-    boxes = arena.place([[0.75, 0.4]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
+    """A start half a metre from a box on the left; a box straight ahead would be a tie, which is not symmetric."""
+    boxes = arena.make_prisms([[0.75, 0.4]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
     scene = arena.empty_room((5.0, 4.0), boxes=boxes)
     return closed_loop.Room(arena=scene, starts=jnp.zeros((1, 3)), key=jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
-def walk(params, model):
-    """A compiled walk of FRAMES frames from a state, for whoever sits at the wheel."""
+def run(params, model):
+    """A compiled rollout of FRAMES frames from a state, for the policy of an index."""
 
     @jax.jit
-    def run(seat, room, state):
-        own = params.controller.replace(driver=params.controller.driver.replace(seat=seat))
-        return rollout.walk(params.replace(controller=own), model, room, state, policies.ANYONE, FRAMES)
+    def run(active, room, state):
+        return rollout.rollout(activated(params, active), model, room, state, policies.SWITCH, frames=FRAMES)
 
-    return run
-
-
-@pytest.fixture(scope="module")
-def put(params, model):
-    """Put a robot into a room."""
-    return jax.jit(lambda room: closed_loop.init(params, model, room, policies.ANYONE))
+    return lambda policy, room, state: run(policies.POLICIES.index(policy), room, state)
 
 
 @pytest.fixture(scope="module")
-def start(put, room):
-    return put(room)
+def init(params, model):
+    """The state of a robot at the first start of a room."""
+    return jax.jit(lambda room: closed_loop.init(params, model, room, policies.SWITCH))
 
 
-def seat(driver):
-    return jnp.asarray(policies.ALL.index(driver))
+@pytest.fixture(scope="module")
+def start(init, room):
+    return init(room)
+
+
+def activated(params: closed_loop.Params, active) -> closed_loop.Params:
+    """The robot with the policy of this index active; `assembly.select_policy` takes no traced one."""
+    switch = replace(params.controller.policy, active=active)
+    return replace(params, controller=replace(params.controller, policy=switch))
 
 
 def mirrored(state: closed_loop.State) -> closed_loop.State:
-    """Begin with the other tripod, as the mirrored robot does."""
-    legs = state.controller.cpg
-    other = replace(legs, activation=legs.activation[MIRRORED_LEGS], adaptation=legs.adaptation[MIRRORED_LEGS])
+    """The same state with the other tripod first, as in the mirrored robot."""
+    rhythm = state.controller.cpg
+    other = replace(rhythm, activation=rhythm.activation[MIRRORED_LEGS], adaptation=rhythm.adaptation[MIRRORED_LEGS])
     return replace(state, controller=replace(state.controller, cpg=other))
 
 
-@pytest.mark.parametrize("driver", [policies.TEACHER, policies.DIRECT], ids=lambda driver: driver.name)
-def test_mirror_the_room_and_the_commands_swap(walk, start, room, driver):
-    _, record = walk(seat(driver), room, start)
-    _, image = walk(seat(driver), room.replace(arena=arena.mirror(room.arena)), mirrored(start))
+@pytest.mark.parametrize("policy", [policies.TEACHER, policies.DIRECT], ids=lambda policy: policy.name)
+def test_mirrored_room_swaps_the_velocities(run, start, room, policy):
+    _, record = run(policy, room, start)
+    _, image = run(policy, room.replace(arena=arena.mirror(room.arena)), mirrored(start))
     for name in ("velocity", "label", "distances", "u", "excitation"):
         np.testing.assert_allclose(getattr(image, name), getattr(record, name)[:, ::-1], atol=1e-5, err_msg=name)
     np.testing.assert_allclose(image.position, np.asarray(record.position) * [1, -1, 1], atol=1e-6)
     assert np.ptp(np.asarray(record.velocity), axis=1).max() > 0.1  # it does turn
 
 
-def test_teacher_turns_away_from_the_box_on_its_left(walk, start, room):
-    _, record = walk(seat(policies.TEACHER), room, start)
+def test_teacher_turns_away_from_the_box_on_its_left(run, start, room):
+    _, record = run(policies.TEACHER, room, start)
     assert np.all(np.asarray(record.velocity)[:, 1] < np.asarray(record.velocity)[:, 0])
     np.testing.assert_array_equal(record.velocity, record.label)
 
 
-def test_eyes_are_quiet_at_first_and_see_the_walk_afterwards(walk, start, room):
-    _, record = walk(seat(policies.BLIND), room, start)
+def test_detectors_are_silent_in_the_first_frame_and_respond_later(run, start, room):
+    _, record = run(policies.BLIND, room, start)
     np.testing.assert_array_equal(np.asarray(record.u)[0], 0.5)
     assert np.all(np.asarray(record.u)[5:].max(axis=0) > 0.5)
 
 
-def test_touch_sets_the_robot_back_at_the_next_start(walk, put, room):
+def test_contact_resets_the_robot_to_the_next_start(run, init, room):
     inside = room.replace(starts=jnp.asarray([[0.5, 0.4, 0.0], [-1.0, 1.0, 0.5]]))
-    _, record = walk(seat(policies.BLIND), inside, put(inside))
+    _, record = run(policies.BLIND, inside, init(inside))
     assert bool(record.contact[0])
-    assert record.setbacks.tolist() == [0] + [1] * (FRAMES - 1)
+    assert record.resets.tolist() == [0] + [1] * (FRAMES - 1)
+    assert record.is_first.tolist() == [True, True] + [False] * (FRAMES - 2)
     np.testing.assert_allclose(record.position[1, :2], [-1.0, 1.0], atol=1e-9)
-    np.testing.assert_array_equal(record.u[1], 0.5)  # a new place is no looming
+    np.testing.assert_array_equal(record.u[1], 0.5)  # no response to the change of place
 
 
-def test_box_that_comes_is_scanned_where_it_is_and_touched_when_it_is_there(walk, put, room):
-    """It stands for a tenth of a second, then comes along the way ahead at 1.2 m/s."""
-    boxes = arena.place([[0.9, 0.0]], 0.2, 0.8, goal=[[0.3, 0.0]], departs=0.1, arrives=0.6)
+def test_moving_box_is_scanned_and_touched_where_it_is(run, init, room):
+    """It stands for a tenth of a second, then approaches head-on at 1.2 m/s."""
+    boxes = arena.make_prisms([[0.9, 0.0]], 0.2, 0.8, goal=[[0.3, 0.0]], departs=0.1, arrives=0.6)
     scene = replace(room.arena, boxes=boxes)
-    coming = room.replace(arena=scene, starts=jnp.asarray([[0.0, 0.0, 0.0], [-1.0, 1.0, 0.5]]))
-    _, record = walk(seat(policies.BLIND), coming, put(coming))
+    approaching = room.replace(arena=scene, starts=jnp.asarray([[0.0, 0.0, 0.0], [-1.0, 1.0, 0.5]]))
+    _, record = run(policies.BLIND, approaching, init(approaching))
 
     touched = int(np.argmax(record.contact))
     assert touched > 3 and not record.contact[touched + 1 :].any()
-    assert record.setbacks.tolist() == [0] * (touched + 1) + [1] * (FRAMES - touched - 1)
-    came = 1.2 * np.clip(np.asarray(record.time) - 0.1, 0, 0.5)
+    assert record.resets.tolist() == [0] * (touched + 1) + [1] * (FRAMES - touched - 1)
+    travelled = 1.2 * np.clip(np.asarray(record.time) - 0.1, 0, 0.5)
     distances = np.asarray(record.distances)[: touched + 1]
-    np.testing.assert_allclose(distances[0] - distances, np.stack([came, came], axis=1)[: touched + 1], atol=0.05)
+    np.testing.assert_allclose(
+        distances[0] - distances, np.stack([travelled, travelled], axis=1)[: touched + 1], atol=0.05
+    )
     assert record.ok.all()
 
 
-def test_robot_that_is_not_finite_is_frozen_and_flagged_and_passes_nothing_on(walk, start, room):
-    sick = start.replace(data=start.data.replace(qvel=start.data.qvel.at[7].set(jnp.nan)))
-    end, record = walk(seat(policies.BLIND), room, sick)
+def test_robot_that_is_not_finite_is_frozen_and_flagged(run, start, room):
+    """Its record stays finite."""
+    broken = start.replace(data=start.data.replace(qvel=start.data.qvel.at[7].set(jnp.nan)))
+    end, record = run(policies.BLIND, room, broken)
     assert record.ok.tolist() == [True] + [False] * (FRAMES - 1)
     assert np.all(np.isfinite(record.position))
     assert not bool(end.ok)
 
 
-def test_blind_walk_without_pictures_is_the_same_walk(params, model, start, room, walk):
-    _, seen = walk(seat(policies.BLIND), room, start)
-    own = params.controller.replace(driver=params.controller.driver.replace(seat=seat(policies.BLIND)))
-    unseen = params.replace(controller=own)
-    _, record = jax.jit(lambda s: rollout.walk(unseen, model, room, s, policies.ANYONE, FRAMES, False))(start)
-    np.testing.assert_allclose(record.position, seen.position, atol=1e-9)
+def test_blind_rollout_is_the_same_without_rendering(params, model, start, room, run):
+    _, rendered = run(policies.BLIND, room, start)
+    blind = activated(params, jnp.asarray(policies.POLICIES.index(policies.BLIND)))
+    black = jax.jit(lambda s: rollout.rollout(blind, model, room, s, policies.SWITCH, frames=FRAMES, render=False))
+    _, record = black(start)
+    np.testing.assert_allclose(record.position, rendered.position, atol=1e-9)
     np.testing.assert_array_equal(record.u, 0.5)
 
 
 @pytest.mark.slow
-def test_chunks_of_a_crowd_are_one_walk(walk, put, params, model, room):
-    """Of four, two a device, each with a start of its own."""
+def test_chunks_of_a_batch_are_one_rollout(run, init, params, model, room):
+    """Of four robots, two on each device, each with a start of its own."""
     starts = jnp.asarray([[[0.0, 0.0, 0.3 * k]] for k in range(4)])
-    rooms = room_batches.stack([room.replace(starts=start) for start in starts])
-    own = params.controller.replace(driver=params.controller.driver.replace(seat=seat(policies.TEACHER)))
-    crowd = params.replace(controller=own)
-    chunks = rollout.chunks(crowd, model, rooms, policies.ANYONE, FRAMES / 30, draw=False, chunk_seconds=0.4)
-    short = rollout.together(list(chunks))
-    assert short.time.shape == (4, FRAMES)
-    np.testing.assert_allclose(short.time[0], np.arange(FRAMES) / 30)
+    rooms = room_batches.stack_rooms([room.replace(starts=start) for start in starts])
+    teacher = activated(params, jnp.asarray(policies.POLICIES.index(policies.TEACHER)))
+    chunks = rollout.rollout_chunks(
+        teacher, model, rooms, policies.SWITCH, FRAMES / 30, render=False, chunk_seconds=0.4
+    )
+    record = rollout.concatenate_time(list(chunks))
+    assert record.time.shape == (4, FRAMES)
+    np.testing.assert_allclose(record.time[0], np.arange(FRAMES) / 30)
     last = room.replace(starts=starts[3])
-    _, alone = walk(seat(policies.TEACHER), last, put(last))
-    np.testing.assert_allclose(short.position[3], alone.position, atol=1e-8)
-    np.testing.assert_allclose(short.label[3], alone.label, atol=1e-8)
+    _, single = run(policies.TEACHER, last, init(last))
+    np.testing.assert_allclose(record.position[3], single.position, atol=1e-8)
+    np.testing.assert_allclose(record.label[3], single.label, atol=1e-8)
 
 
-@pytest.mark.parametrize(("robots", "shares"), [(1, 1), (2, 1), (3, 1), (4, 2), (5, 2), (6, 2)])
-def test_crowds_are_dealt_out_and_no_robot_is_alone_on_a_device(robots, shares):
+@pytest.mark.parametrize(("robots", "devices"), [(1, 1), (2, 1), (3, 1), (4, 2), (5, 2), (6, 2)])
+def test_each_device_gets_at_least_two_robots(robots, devices):
     assert jax.local_device_count() == 2
-    assert sharding.shares(robots) == shares
+    assert sharding.device_count(robots) == devices
 
 
 @pytest.mark.parametrize("robots", [1, 3, 4, 5])
-def test_a_crowd_that_does_not_come_out_even_is_filled_up_and_cut(robots):
+def test_uneven_batches_are_padded_and_cut(robots):
     numbers, keys = jnp.arange(robots), jax.random.split(jax.random.key(0), robots)
     work = lambda n, keys: (n**2, jax.vmap(jax.random.uniform)(keys))  # noqa: E731
-    dealt = jax.jit(lambda *batches: sharding.deal(work, *batches))
-    squares, luck = dealt(numbers, keys)
+    sharded = jax.jit(lambda *batches: sharding.shard_robots(work, *batches))
+    squares, samples = sharded(numbers, keys)
     np.testing.assert_array_equal(squares, np.arange(robots) ** 2)
-    np.testing.assert_array_equal(luck, jax.vmap(jax.random.uniform)(keys))
+    np.testing.assert_array_equal(samples, jax.vmap(jax.random.uniform)(keys))

@@ -1,7 +1,9 @@
-"""Walks on disk: the same numbers back, nothing lost but a running chunk, bad files told in one line."""
+"""Recorded walks on disk: exact, complete up to the present chunk, damaged files refused in one line."""
 
 import json
-from types import SimpleNamespace
+import shutil
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -10,6 +12,7 @@ import pytest
 
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import episodes
+from lgmdjax.simulation.closed_loop import Record
 
 SHAPES = {
     "position": (3,),
@@ -26,34 +29,40 @@ SHAPES = {
 SETTINGS = {"camera": {"width": 320}, "threshold": 4.5}
 
 
-def record(robots=2, frames=20, start=0, dtype: type = np.float32) -> dict[str, np.ndarray]:
-    """What a rollout gives: arrays with axes (robot, frame); noise, so that a mix-up shows."""
+VERSION_1 = Path(__file__).parents[1] / "data" / "v0.1.0" / "smoke-0" / "collect" / "episodes"
+
+
+def record(robots=2, frames=20, start=0, dtype: type = np.float32) -> Record:
+    """Random numbers in the shapes of a rollout, with axes (robot, frame), so that exchanged columns are noticed."""
     rng = np.random.default_rng(start)
-    fields: dict[str, np.ndarray] = {
-        name: rng.normal(size=(robots, frames, *shape)).astype(dtype) for name, shape in SHAPES.items()
-    }
-    fields["time"] = np.tile(((start + np.arange(frames)) / 30).astype(dtype), (robots, 1))
-    fields["contact"] = np.zeros((robots, frames), bool)
-    fields["fresh"] = np.zeros((robots, frames), bool)
-    fields["fresh"][:, 0] = start == 0
-    fields["setbacks"] = np.zeros((robots, frames), np.int32)
-    fields["ok"] = np.ones((robots, frames), bool)
-    return fields
+    is_first = np.zeros((robots, frames), bool)
+    is_first[:, 0] = start == 0
+    return Record(
+        **{name: rng.normal(size=(robots, frames, *shape)).astype(dtype) for name, shape in SHAPES.items()},
+        time=np.tile(((start + np.arange(frames)) / 30).astype(dtype), (robots, 1)),
+        contact=np.zeros((robots, frames), bool),
+        is_first=is_first,
+        resets=np.zeros((robots, frames), np.int32),
+        ok=np.ones((robots, frames), bool),
+    )
 
 
 def write(folder, *records, settings=SETTINGS, **walk):
     writer = episodes.Writer(folder, settings)
     for chunk in records:
-        robots = len(chunk["time"] if isinstance(chunk, dict) else chunk.time)
-        writer.write(chunk, **{"episode": 0, "rooms": range(robots), "seed": 7} | walk)
+        writer.write(chunk, **{"episode": 0, "rooms": range(len(chunk.time)), "seed": 7} | walk)
     return writer
 
 
+def test_every_field_of_a_record_has_columns():
+    assert list(episodes.FIELDS) == [field.name for field in fields(Record)]
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_what_comes_back_is_what_was_written(tmp_path, dtype):
-    """Bit for bit, robot by robot, chunks joined in order; from a mapping as from an object."""
+def test_walks_are_read_as_they_were_written(tmp_path, dtype):
+    """Bit for bit, robot by robot, chunks joined in order."""
     first, second = record(dtype=dtype), record(start=20, dtype=dtype)
-    write(tmp_path, first, SimpleNamespace(**second), rooms=[5, 8])
+    write(tmp_path, first, second, rooms=[5, 8])
     walks = episodes.read(tmp_path)
     assert [(w.episode, w.robot, w.room, w.seed, len(w)) for w in walks] == [
         (0, 0, 5, 7, 40),
@@ -61,12 +70,12 @@ def test_what_comes_back_is_what_was_written(tmp_path, dtype):
     ]
     for robot, walk in enumerate(walks):
         for name in episodes.FIELDS:
-            expected = np.concatenate([first[name][robot], second[name][robot]])
+            expected = np.concatenate([getattr(both, name)[robot] for both in (first, second)])
             np.testing.assert_array_equal(getattr(walk, name), expected)
             assert getattr(walk, name).dtype == expected.dtype
 
 
-def test_episodes_are_told_apart(tmp_path):
+def test_episodes_are_separate_walks(tmp_path):
     write(tmp_path, record(), record(start=20), episode=0)
     write(tmp_path, record(robots=3), episode=1, seed=8)
     walks = episodes.read(tmp_path, SETTINGS)
@@ -79,20 +88,35 @@ def test_episodes_are_told_apart(tmp_path):
     ]
 
 
-def test_a_stranger_can_read_the_file(tmp_path):
-    """Names, units, parameters and versions are in the Parquet file itself."""
+def test_a_file_describes_itself(tmp_path):
+    """It has names, units, parameters and versions."""
     write(tmp_path, record())
     table = pq.read_table(tmp_path / "chunk-00000.parquet")
     header = json.loads(table.schema.metadata[b"lgmdjax"])
     assert table.num_rows == 40 and table.column_names == list(episodes.COLUMNS)
     assert header["units"]["distance_left"] == "m" and header["units"]["joint_17"] == "rad"
-    assert header["parameters"] == SETTINGS == episodes.parameters(tmp_path)
+    assert header["parameters"] == SETTINGS == episodes.read_parameters(tmp_path)
     assert set(header["versions"]) >= {"jax", "mujoco"}
-    assert header["version"] == 1
+    assert header["version"] == 2
 
 
-def test_a_kill_loses_the_running_chunk_at_most(tmp_path, monkeypatch):
-    """Whatever the moment: in the middle of the file, or before it gets its name."""
+def test_version_1_is_read_and_continued(tmp_path):
+    """Its columns "fresh" and "setbacks" are now `is_first` and `resets`; new chunks have the present version."""
+    old = VERSION_1 / "chunk-00000.parquet"
+    shutil.copyfile(old, tmp_path / old.name)
+    writer = episodes.Writer(tmp_path, episodes.read_parameters(tmp_path))
+    before = episodes.read(tmp_path)
+    np.testing.assert_array_equal(before[0].is_first, pq.read_table(old)["fresh"].to_numpy()[: len(before[0])])
+    dtype = before[0].position.dtype
+    added = record(robots=2, start=60, dtype=dtype.type)
+    writer.write(added, episode=before[0].episode, rooms=[walk.room for walk in before], seed=before[0].seed)
+    after = episodes.read(tmp_path)
+    assert [len(walk) for walk in after] == [len(walk) + 20 for walk in before]
+    np.testing.assert_array_equal(after[1].resets, np.concatenate([before[1].resets, added.resets[1]]))
+
+
+def test_an_interruption_loses_only_the_present_chunk(tmp_path, monkeypatch):
+    """Also in the middle of the file, before it gets its name."""
     writer = write(tmp_path, record(), record(start=20))
 
     def killed(table, path, **options):
@@ -110,24 +134,24 @@ def test_a_kill_loses_the_running_chunk_at_most(tmp_path, monkeypatch):
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".parquet"] * 3
 
 
-def test_stretches_are_sound_uninterrupted_and_touch_nothing(tmp_path):
-    """Robot 0 touches something at frame 8 and is put down; robot 1 falls at frame 12 of 20."""
-    walked = record()
-    walked["contact"][0, 8] = True
-    walked["setbacks"][0, 9:] = 1
-    walked["fresh"][0, 9] = True
-    walked["ok"][1, 12:] = False
-    write(tmp_path, walked)
+def test_segments_have_no_contact_reset_or_fall(tmp_path):
+    """Robot 0 has contact at frame 8 and is reset; robot 1 falls at frame 12 of 20."""
+    recorded = record()
+    recorded.contact[0, 8] = True
+    recorded.resets[0, 9:] = 1
+    recorded.is_first[0, 9] = True
+    recorded.ok[1, 12:] = False
+    write(tmp_path, recorded)
     walks = episodes.read(tmp_path)
-    frames = [np.round(s.time * 30).astype(int) for s in episodes.stretches(walks, minimum=5)]
+    frames = [np.round(s.time * 30).astype(int) for s in episodes.segments(walks, min_frames=5)]
     assert [(f[0], f[-1]) for f in frames] == [(2, 7), (11, 19), (2, 11)]
-    assert [len(s) for s in episodes.stretches(walks, minimum=9, settle=0)] == [11, 12]
-    assert not episodes.stretches(walks, minimum=30)
+    assert [len(s) for s in episodes.segments(walks, min_frames=9, settle_frames=0)] == [11, 12]
+    assert not episodes.segments(walks, min_frames=30)
 
 
-def test_a_missing_stretch_of_time_ends_a_stretch(tmp_path):
+def test_missing_frames_end_a_segment(tmp_path):
     write(tmp_path, record(), record(start=35))
-    assert [len(s) for s in episodes.stretches(episodes.read(tmp_path), minimum=1)] == [18, 20] * 2
+    assert [len(s) for s in episodes.segments(episodes.read(tmp_path), min_frames=1)] == [18, 20] * 2
 
 
 def refused(folder, match, **arguments):
@@ -162,7 +186,7 @@ def test_files_of_another_kind_or_version_are_refused(tmp_path):
     table = pq.read_table(path)
     header = json.loads(table.schema.metadata[b"lgmdjax"])
     pq.write_table(table.replace_schema_metadata({"lgmdjax": json.dumps(header | {"version": 0})}), path)
-    refused(tmp_path, "expected walks of version 1, got 0")
+    refused(tmp_path, "expected walks of version 1 or 2, got 0")
     pq.write_table(table.drop_columns("u_left"), path)
     refused(tmp_path, "got none called u_left")
     pq.write_table(pa.table({"u": [1.0]}), path)
@@ -180,11 +204,11 @@ def test_walks_of_other_settings_are_refused(tmp_path):
     refused(tmp_path, "one precision")
 
 
-def test_records_that_do_not_fit_are_refused(tmp_path):
+def test_records_of_a_wrong_shape_are_refused(tmp_path):
     with pytest.raises(InputError, match="a room for each of 2 robots, got 3"):
         write(tmp_path, record(), rooms=range(3))
     with pytest.raises(InputError, match=r"episodes u: expected 2 numbers a frame .* got shape \(2, 20, 3\)"):
-        write(tmp_path, record() | {"u": np.zeros((2, 20, 3))})
+        write(tmp_path, replace(record(), u=np.zeros((2, 20, 3))))
     assert not list(tmp_path.iterdir())
     file = tmp_path / "file"
     file.write_text("")

@@ -1,4 +1,4 @@
-"""The pictures of a recorded walk are what the walking robots saw."""
+"""Pictures rendered from a recorded walk are those of the rollout."""
 
 import jax
 import jax.numpy as jnp
@@ -10,29 +10,30 @@ from lgmdjax.control import policies
 from lgmdjax.sensors import camera
 from lgmdjax.simulation import closed_loop, episodes, rerender, rollout, room_batches
 
-ROBOTS = 4  # two a device
-EYES = camera.Params(width=80, height=60, overlap=0.6)
-FRAMES = 45  # more than one call of the drawing program, and less than two
+ROBOTS = 4  # two on each device
+CAMERA = camera.Params(width=80, height=60, overlap=0.6)
+FRAMES = 45  # more than one call of the rendering program, and less than two
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("float32")
-def test_pictures_are_drawn_again_from_the_poses(tmp_path):
-    """From Parquet, to the last bit as the walking robots saw them, whatever part of the walk is drawn."""
-    bend = policies.Blind(velocity=jnp.asarray([1.0, 0.6]))
-    params, model = closed_loop.assemble(bend, eyes=EYES), hexapod.build()
+def test_pictures_are_rendered_again_from_the_poses(tmp_path):
+    """From Parquet, to the last bit those of the rollout, whichever part of it is rendered."""
+    curve = policies.BlindParams(velocity=jnp.asarray([1.0, 0.6]))
+    params, model = closed_loop.assemble(curve, camera_params=CAMERA), hexapod.build()
     rooms = room_batches.random_rooms(jax.random.key(1), ROBOTS, density=0.3)
-    states, seen = rollout.start(params, model, rooms, driver=policies.BLIND), []
+    blind = policies.BLIND
+    states, frames = rollout.reset_batch(params, model, rooms, policy=blind), []
     writer = episodes.Writer(tmp_path, {})
     for _ in range(FRAMES):
-        states, chunk = rollout.advance(params, model, rooms, states, driver=policies.BLIND, frames=1, draw=True)
-        seen.append(np.array(states.controller.lgmd.frame))
+        states, chunk = rollout.rollout_batch(params, model, rooms, states, policy=blind, frames=1, render=True)
+        frames.append(np.array(states.controller.lgmd.frame))
         writer.write(chunk, episode=0, rooms=range(ROBOTS), seed=1)
-    walked = episodes.batched(episodes.read(tmp_path))
-    drawn = rerender.walks(EYES, rooms.arena, walked)
-    np.testing.assert_array_equal(drawn, np.stack(seen, axis=1))
-    assert np.ptp(drawn, axis=1).max() > 20  # the world does move
-    part, turned = (jax.tree.map(lambda leaf, of=of: leaf[of], walked) for of in (np.s_[:, 7:11], np.s_[::-1]))
-    np.testing.assert_array_equal(drawn[:, 7:11], rerender.walks(EYES, rooms.arena, part))
-    their_rooms = jax.tree.map(lambda leaf: leaf[::-1], rooms.arena)
-    np.testing.assert_array_equal(drawn[::-1], rerender.walks(EYES, their_rooms, turned))
+    record = episodes.stack_walks(episodes.read(tmp_path))
+    pictures = rerender.render_walks(CAMERA, rooms.arena, record)
+    np.testing.assert_array_equal(pictures, np.stack(frames, axis=1))
+    assert np.ptp(pictures, axis=1).max() > 20  # the pictures do change
+    part, reverse = (jax.tree.map(lambda leaf, of=of: leaf[of], record) for of in (np.s_[:, 7:11], np.s_[::-1]))
+    np.testing.assert_array_equal(pictures[:, 7:11], rerender.render_walks(CAMERA, rooms.arena, part))
+    reverse_rooms = jax.tree.map(lambda leaf: leaf[::-1], rooms.arena)
+    np.testing.assert_array_equal(pictures[::-1], rerender.render_walks(CAMERA, reverse_rooms, reverse))

@@ -1,1 +1,5 @@
-"""Figures of the report and the notebooks: numbers in, a matplotlib `Figure` out."""
+"""Figures of the report and the notebooks; each function returns a matplotlib `Figure`."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

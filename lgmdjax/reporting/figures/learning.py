@@ -1,4 +1,4 @@
-"""TODO docstring."""
+"""Plots of learning: losses, and predictions over time."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,17 +8,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy import ndarray
 
-from lgmdjax.reporting.figures.style import LEFT, PALETTE, RIGHT, WIDTH, styled
+from lgmdjax.reporting.figures.style import LEFT_COLOUR, PALETTE, RIGHT_COLOUR, WIDTH, styled
 
 
 @styled
-def losses(curves: Mapping[str, Mapping[str, Sequence[float]]], names: Mapping[str, str]) -> Figure:
-    """Draw mean squared error over epochs (fig. 11) on a log axis: training and test beside each other.
+def plot_losses(curves: Mapping[str, Mapping[str, Sequence[float]]], names: Mapping[str, str]) -> Figure:
+    """Plot the mean squared error over epochs (fig. 11) on a log axis, training and test side by side.
 
     Args:
-        curves: for each learner "train" and "test", an error [(0.05 m/s)^2] an epoch;
-            one entry alone is a level.
-        names: how to call the learners in the legend.
+        curves: of each learner "train" and "test", one error [(0.05 m/s)^2] per epoch; a single entry is plotted as a
+            horizontal line.
+        names: of the learners in the legend.
     """
     figure = Figure(figsize=(WIDTH, 2.9))
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -42,35 +42,38 @@ def losses(curves: Mapping[str, Mapping[str, Sequence[float]]], names: Mapping[s
 
 
 @styled
-def stretch(
+def plot_predictions(
     time: Float[ndarray, " frames"],
     u: Float[ndarray, "frames 2"],
     distances: Float[ndarray, "frames 2"],
     label: Float[ndarray, "frames 2"],
     predicted: Float[ndarray, "frames 2"],
 ) -> Figure:
-    """Draw a stretch of recorded walking (fig. 12): u, distances, the rule's command and the learner's.
+    """Plot a segment of recorded walking (fig. 12): u, distances, the rule's command and the learned policy's command.
 
-    u, which every step shakes, is drawn with its mean over a second.
+    u oscillates with every step and is plotted with its mean over a second.
 
     Args:
-        time: seconds. u: LGMD outputs. distances: nearest obstacle a side [m].
-        label, predicted: velocities in multiples of 0.05 m/s.
+        time: s.
+        u: LGMD outputs.
+        distances: to the nearest obstacle on either side [m].
+        label: the rule's command, in multiples of 0.05 m/s.
+        predicted: the learned policy's command, in multiples of 0.05 m/s.
     """
     figure = Figure(figsize=(WIDTH, 5.4))
     panels = figure.subplots(4, 1, sharex=True)
     titles = (
-        ("LGMD outputs: all that the learner is given", "u [1]"),
-        ("nearest obstacle by laser: all that the rule is given", "d [m]"),
+        ("LGMD outputs: input of the learned policy", "u [1]"),
+        ("nearest obstacle by laser: input of the rule", "d [m]"),
         ("command of the rule (the label)", "v [0.05 m/s]"),
-        ("command of the learned controller", "v [0.05 m/s]"),
+        ("command of the learned policy", "v [0.05 m/s]"),
     )
     for axes, series, (title, unit) in zip(panels, (u, distances, label, predicted), titles, strict=True):
-        for values, colour, side in zip(series.T, (LEFT, RIGHT), ("left", "right"), strict=True):
-            flickers = series is u
-            axes.plot(time, values, color=colour, linewidth=1.0, alpha=0.35 if flickers else 1.0, label=side)
-            if flickers:
-                axes.plot(time, _averaged(time, values), color=colour, linewidth=1.3)
+        for values, colour, side in zip(series.T, (LEFT_COLOUR, RIGHT_COLOUR), ("left", "right"), strict=True):
+            oscillates = series is u
+            axes.plot(time, values, color=colour, linewidth=1.0, alpha=0.35 if oscillates else 1.0, label=side)
+            if oscillates:
+                axes.plot(time, _average_over_second(time, values), color=colour, linewidth=1.3)
         axes.set(title=title, ylabel=unit)
         axes.margins(x=0)
     panels[3].sharey(panels[2])
@@ -81,8 +84,10 @@ def stretch(
     return figure
 
 
-def _averaged(time: Float[ndarray, " frames"], values: Float[ndarray, " frames"]) -> Float[ndarray, " frames"]:
-    """Average over a second; at the ends over what there is of it."""
+def _average_over_second(
+    time: Float[ndarray, " frames"], values: Float[ndarray, " frames"]
+) -> Float[ndarray, " frames"]:
+    """Average over a second; at the ends over the part of it that is recorded."""
     rate = (len(time) - 1) / (time[-1] - time[0]) if len(time) > 1 else 1.0
     window = np.ones(min(max(round(rate), 1), len(time)))
     return np.convolve(values, window, mode="same") / np.convolve(np.ones_like(values), window, mode="same")

@@ -1,53 +1,54 @@
-"""The figures of the report: numbers in, a matplotlib `Figure` out, nothing read and nothing kept.
+"""Style of all figures: size, colours, matplotlib settings, and the conversion to SVG and PNG.
 
-Every function draws one figure for a page about 18 cm wide, on the Agg canvas and without pyplot, so that no
-window system and no global figure is involved. Left is blue and right is orange throughout, in the palette of
-Okabe & Ito, which stays apart for colour-blind eyes. The file is long because it is eleven times the same kind of
-thing: the functions share a style and nothing else.
+The plot functions of this folder return a matplotlib `Figure` about 18 cm wide. They use the Agg canvas without pyplot,
+so they need no window system and leave no global figure behind. Left is blue and right is orange throughout, in the
+palette of Okabe & Ito, which colour-blind readers can tell apart.
 
-| figure here    | of the paper | shows                                                   |
-| -------------- | ------------ | ------------------------------------------------------- |
-| `rhythm`       | 5b           | outputs of the six CPG units from a random start        |
-| `foot_paths`   | 5c           | path of leg 1's foot, commanded and simulated           |
-| `gait_sweep`   | -            | speed and turning asked for and walked                  |
-| `layers`       | 6b           | picture, E, I and S of one eye                          |
-| `calibration`  | -            | score of the candidates for T_s and W_I                 |
-| `losses`       | 11           | training and test error of every learner                |
-| `stretch`      | 12           | u, d, the rule's v and the learner's v side by side     |
-| `trajectories` | 13           | walks in a room, with its obstacles                     |
-| `rooms`        | -            | walks in several rooms                                  |
-| `passages`     | 14, 16       | ways past what stands in the way                        |
-| `drivers`      | -            | collisions per 100 m of every driver, with intervals    |
+| figure                                | of the paper | shows                                                    |
+| ------------------------------------- | ------------ | -------------------------------------------------------- |
+| `locomotion.plot_cpg_outputs`         | 5b           | outputs of the six CPG units from a random start         |
+| `locomotion.plot_foot_paths`          | 5c           | path of leg 1's foot, commanded and simulated            |
+| `locomotion.plot_gait_sweep`          | -            | speed and turning, commanded and simulated               |
+| `detection.plot_lgmd_layers`          | 6b           | picture, E, I and S of one eye                           |
+| `detection.plot_grid_search`          | -            | score of the candidates for T_s and W_I                  |
+| `learning.plot_losses`                | 11           | training and test error of every learner                 |
+| `learning.plot_predictions`           | 12           | u, d, the rule's v and the learned v over time           |
+| `trajectories.plot_trajectories`      | 13           | walks of all policies in one room                        |
+| `trajectories.plot_walks`             | -            | walks of a record in their rooms                         |
+| `trajectories.plot_passages`          | 14, 16       | paths past an obstacle                                   |
+| `trajectories.plot_collision_rates`   | -            | collisions per 100 m of every policy, with intervals     |
 """
 
 import io
 from collections.abc import Callable
 from functools import wraps
-from typing import Any
+from typing import Any, ParamSpec
 
 import matplotlib
 from cycler import cycler
 from matplotlib.figure import Figure
 
-WIDTH = 7.2  # inches, the width of the report's column
-LEFT, RIGHT = "#0072B2", "#D55E00"
-INK, QUIET, FAINT, OBSTACLE, ALARM = "#222222", "#767676", "#dddddd", "#c9c5bd", "#c1121f"
+_P = ParamSpec("_P")
+
+WIDTH = 7.2  # inches, width of the report's column
+LEFT_COLOUR, RIGHT_COLOUR = "#0072B2", "#D55E00"
+DARK, GREY, LIGHT_GREY, OBSTACLE_COLOUR, RED = "#222222", "#767676", "#dddddd", "#c9c5bd", "#c1121f"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-DRIVERS = {
+POLICY_COLOURS: dict[str, str] = {
     "teacher": "#009E73",
     "learned": "#0072B2",
     "blind": "#555555",
     "direct": "#CC79A7",
     "random": "#E69F00",
 }
-STYLE: dict[Any, Any] = {
+STYLE: dict[Any, object] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9,
     "axes.titlelocation": "left",
     "axes.labelsize": 8.5,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": QUIET,
+    "axes.labelcolor": DARK,
+    "axes.edgecolor": GREY,
     "axes.linewidth": 0.7,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -56,36 +57,36 @@ STYLE: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=PALETTE),
     "grid.color": "#ececec",
     "grid.linewidth": 0.7,
-    "xtick.color": QUIET,
-    "ytick.color": QUIET,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": DARK,
+    "ytick.labelcolor": DARK,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
     "legend.frameon": False,
     "legend.fontsize": 8,
     "lines.linewidth": 1.3,
     "lines.solid_capstyle": "butt",
-    "text.color": INK,
+    "text.color": DARK,
     "figure.constrained_layout.use": True,
     "svg.fonttype": "path",
     "svg.hashsalt": "lgmdjax",
 }
 
 
-def styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
-    """Draw under the report's style, and leave matplotlib's settings as they were."""
+def styled(plot: Callable[_P, Figure]) -> Callable[_P, Figure]:
+    """Decorate a plot function so that it plots in the report's style and leaves matplotlib's settings unchanged."""
 
-    @wraps(draw)
-    def wrapper(*args: Any, **kwargs: Any) -> Figure:
+    @wraps(plot)
+    def wrapper(*args: _P.args, **kwargs: _P.kwargs) -> Figure:
         with matplotlib.rc_context(STYLE):
-            return draw(*args, **kwargs)
+            return plot(*args, **kwargs)
 
     return wrapper
 
 
 def to_svg(figure: Figure) -> bytes:
-    """Write a figure as SVG with text as outlines, the same bytes for the same figure."""
+    """Convert a figure to SVG with text as outlines; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
@@ -93,7 +94,7 @@ def to_svg(figure: Figure) -> bytes:
 
 
 def to_png(figure: Figure, dpi: float = 150.0) -> bytes:
-    """Write a figure as PNG."""
+    """Convert a figure to PNG."""
     buffer = io.BytesIO()
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format="png", dpi=dpi)

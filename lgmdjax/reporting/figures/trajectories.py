@@ -1,8 +1,9 @@
-"""TODO docstring."""
+"""Plots of walks seen from above, and of collision rates."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
@@ -10,58 +11,80 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy import ndarray
 
-from lgmdjax.reporting.figures.style import ALARM, DRIVERS, INK, LEFT, OBSTACLE, PALETTE, QUIET, WIDTH, styled
-from lgmdjax.world.arena import Arena, Prisms, is_overhead, is_parked
+from lgmdjax.reporting.figures.style import (
+    DARK,
+    GREY,
+    LEFT_COLOUR,
+    OBSTACLE_COLOUR,
+    PALETTE,
+    POLICY_COLOURS,
+    RED,
+    WIDTH,
+    styled,
+)
+from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.simulation.closed_loop import Record, Room
+from lgmdjax.world.arena import Arena, Prisms, is_inactive, is_overhead
 
-SURROUNDINGS = 2.5  # m, of the start of a trial that are drawn in any case
+START_SURROUNDINGS = 2.5  # m; obstacles nearer to the start are always inside the plot
+POINT_STRIDE = 8  # frames between two points of a path: a quarter of a second, which keeps the file small
 
 
-class Walks(NamedTuple):
-    """What one driver's robots did in a room; axes (robot, frame)."""
+class Paths(NamedTuple):
+    """Paths of robots in one room; axes (robot, frame)."""
 
     positions: Float[ndarray, "robots frames dimensions"]  # m, x and y first
-    setbacks: Int[ndarray, "robots frames"]
+    resets: Int[ndarray, "robots frames"]
     contact: Bool[ndarray, "robots frames"]
 
 
 @styled
-def trajectories(arena: Arena | None, walks: Mapping[str, Walks], first: str = "learned") -> Figure:
-    """Draw the walks of every driver in one room seen from above (fig. 13), `first` large, touches marked.
+def plot_walks(record: Record, rooms: Room | Arena | None = None) -> Figure:
+    """Plot recorded walks seen from above, with starts and collisions marked; a reset interrupts the line.
 
-    Without an arena only the paths are drawn. A set-back breaks the line.
+    Args:
+        record: recorded walks, axes (robot, frame), or one walk, axis (frame,).
+        rooms: a batch of rooms gives one panel per robot; a single room, one panel with all robots; None, paths alone.
+
+    ```python
+    import jax
+    import lgmdjax as lj
+
+    rooms = lj.random_rooms(jax.random.key(0), 4)
+    record = lj.rollout(lj.load_robot(), rooms, seconds=30)
+    lj.plot_walks(record, rooms)
+    ```
     """
-    others = [name for name in walks if name != first]
-    figure = Figure(figsize=(WIDTH, 3.9 if others else 5.6))
-    rows = max((len(others) + 1) // 2, 1)
-    if others:
-        large, small = np.asarray(figure.subfigures(1, 2, width_ratios=(1.15, 1)))
-        panels = {first: large.subplots(), **dict(zip(others, small.subplots(rows, 2).ravel(), strict=False))}
+    series = record.position, record.resets, record.contact
+    paths = Paths(*(np.asarray(leaf)[None] if np.ndim(record.time) == 1 else np.asarray(leaf) for leaf in series))
+    arena = rooms.arena if isinstance(rooms, Room) else rooms
+    if arena is None or np.ndim(arena.bounds) == 1:
+        figure = _plot_panels([arena], [paths])
     else:
-        panels = {first: figure.subplots()}
-    for name, axes in panels.items():
-        if arena is not None:
-            draw_room(axes, arena)
-        draw_walks(axes, walks[name], colours=PALETTE if name == first else (DRIVERS.get(name, QUIET),))
-        axes.set_title(name)
-        axes.set_aspect("equal")
-        axes.grid(False)
-        if name != first:
-            axes.tick_params(labelleft=False, labelbottom=False, length=0)
-            axes.spines[:].set_visible(False)
-    panels[first].set(xlabel="x [m]", ylabel="y [m]")
-    panels[first].legend(loc="upper left", bbox_to_anchor=(0, -0.13), ncols=2, borderaxespad=0)
+        arenas = [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], arena) for k in range(len(paths.positions))]
+        figure = _plot_panels(arenas, [Paths(*(leaf[[k]] for leaf in paths)) for k in range(len(arenas))])
+    if len(figure.axes) == 1:
+        figure.set_size_inches(WIDTH, 5.6)
+    lower_left = figure.axes[(len(figure.axes) - 1) // 3 * 3]
+    lower_left.set(xlabel="x [m]", ylabel="y [m]")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=2)
     return figure
 
 
 @styled
-def rooms(arenas: Sequence[Arena], walks: Sequence[Walks]) -> Figure:
-    """Draw what was walked in some rooms seen from above, side by side, touches marked."""
+def plot_rooms(arenas: Sequence[Arena], paths: Sequence[Paths]) -> Figure:
+    """Plot the walks in several rooms seen from above, one panel per room, with collisions marked."""
+    return _plot_panels(arenas, paths)
+
+
+def _plot_panels(arenas: Sequence[Arena | None], paths: Sequence[Paths]) -> Figure:
     rows = (len(arenas) + 2) // 3
     figure = Figure(figsize=(WIDTH, 0.3 + 2.4 * rows))
     panels = np.asarray(figure.subplots(rows, min(len(arenas), 3), squeeze=False)).ravel()
-    for axes, arena, walk in zip(panels, arenas, walks, strict=False):
-        draw_room(axes, arena)
-        draw_walks(axes, walk, colours=PALETTE)
+    for axes, arena, own in zip(panels, arenas, paths, strict=False):
+        if arena is not None:
+            add_room(axes, arena)
+        add_paths(axes, own, colours=PALETTE)
         axes.set_aspect("equal")
         axes.grid(False)
     for axes in panels[len(arenas) :]:
@@ -70,105 +93,146 @@ def rooms(arenas: Sequence[Arena], walks: Sequence[Walks]) -> Figure:
 
 
 @styled
-def passages(
+def plot_trajectories(arena: Arena | None, paths: Mapping[str, Paths], main: str = "learned") -> Figure:
+    """Plot the walks of every policy in one room seen from above (fig. 13), with collisions marked.
+
+    Args:
+        arena: the room; None plots the paths alone.
+        paths: of each policy, by its name. A reset interrupts the line.
+        main: name of the policy in the large panel.
+    """
+    others = [name for name in paths if name != main]
+    figure = Figure(figsize=(WIDTH, 3.9 if others else 5.6))
+    rows = max((len(others) + 1) // 2, 1)
+    if others:
+        large, small = np.asarray(figure.subfigures(1, 2, width_ratios=(1.15, 1)))
+        panels = {main: large.subplots(), **dict(zip(others, small.subplots(rows, 2).ravel(), strict=False))}
+    else:
+        panels = {main: figure.subplots()}
+    for name, axes in panels.items():
+        if arena is not None:
+            add_room(axes, arena)
+        add_paths(axes, paths[name], colours=PALETTE if name == main else (POLICY_COLOURS.get(name, GREY),))
+        axes.set_title(name)
+        axes.set_aspect("equal")
+        axes.grid(False)
+        if name != main:
+            axes.tick_params(labelleft=False, labelbottom=False, length=0)
+            axes.spines[:].set_visible(False)
+    panels[main].set(xlabel="x [m]", ylabel="y [m]")
+    panels[main].legend(loc="upper left", bbox_to_anchor=(0, -0.13), ncols=2, borderaxespad=0)
+    return figure
+
+
+@styled
+def plot_passages(
     arenas: Sequence[Arena],
     paths: Sequence[Float[ndarray, "_ 2"]],
     touched: Bool[ndarray, " robots"],
     clearance: Float[ndarray, " robots"],
-    across: Float[ndarray, " robots"] | None = None,
+    lateral_offsets: Float[ndarray, " robots"] | None = None,
 ) -> Figure:
-    """Draw how robots passed what stood in their way (figs. 14 and 16), seen from above; those that touched it red.
+    """Plot paths past an obstacle seen from above (figs. 14 and 16); those with a contact are red.
 
     Args:
-        arenas: a room a robot. paths: until its end. touched: something.
-        clearance: the least until the end [m].
-        across: how far beside the robot's way the obstacle stood [m]; the clearance is then drawn against it.
+        arenas: a room per robot.
+        paths: of each robot until the end of its trial [m].
+        touched: whether the robot touched something.
+        clearance: smallest clearance until the end [m].
+        lateral_offsets: of the obstacle from the robot's heading [m]; a second panel plots the clearance over them.
     """
-    figure = Figure(figsize=(WIDTH, 4.2 if across is None else 6.4))
-    axes = figure.subplots() if across is None else _beside(figure, touched, clearance, across)
+    figure = Figure(figsize=(WIDTH, 4.2 if lateral_offsets is None else 6.4))
+    axes = (
+        figure.subplots()
+        if lateral_offsets is None
+        else _add_clearance_panel(figure, touched, clearance, lateral_offsets)
+    )
     for arena in arenas:
-        draw_room(axes, arena)
+        add_room(axes, arena)
     for path, bad in zip(paths, touched, strict=True):
-        axes.plot(*path[::8].T, color=ALARM if bad else LEFT, linewidth=0.9, alpha=0.7, zorder=3)
-        axes.plot(*path[-1], "X" if bad else "o", color=ALARM if bad else LEFT, markersize=4, zorder=4)
-    things = np.concatenate([np.asarray(prisms.centre) for prisms in (arenas[0].boxes, arenas[0].cylinders)])
-    near = things[np.linalg.norm(things - paths[0][0], axis=1) < SURROUNDINGS]
+        axes.plot(*path[::POINT_STRIDE].T, color=RED if bad else LEFT_COLOUR, linewidth=0.9, alpha=0.7, zorder=3)
+        axes.plot(*path[-1], "X" if bad else "o", color=RED if bad else LEFT_COLOUR, markersize=4, zorder=4)
+    centres = np.concatenate([np.asarray(prisms.centre) for prisms in (arenas[0].boxes, arenas[0].cylinders)])
+    near = centres[np.linalg.norm(centres - paths[0][0], axis=1) < START_SURROUNDINGS]
     shown = np.concatenate([*paths, near])
-    least, most = shown.min(axis=0), shown.max(axis=0)
-    axes.set(xlim=(least[0] - 0.4, most[0] + 0.8), ylim=(least[1] - 0.8, most[1] + 0.8))
-    axes.set(xlabel="x [m]", ylabel="y [m]", title=f"{np.sum(~touched)} of {len(paths)} untouched", aspect="equal")
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    axes.set(xlim=(low[0] - 0.4, high[0] + 0.8), ylim=(low[1] - 0.8, high[1] + 0.8))
+    title = f"{np.sum(~touched)} of {len(paths)} without contact"
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=title, aspect="equal")
     axes.grid(False)
     return figure
 
 
-def _beside(
-    figure: Figure, touched: Bool[ndarray, " n"], clearance: Float[ndarray, " n"], across: Float[ndarray, " n"]
+def _add_clearance_panel(
+    figure: Figure,
+    touched: Bool[ndarray, " n"],
+    clearance: Float[ndarray, " n"],
+    lateral_offsets: Float[ndarray, " n"],
 ) -> Axes:
-    """Draw the clearance against where the obstacle stood in the lower third; give the axes above."""
+    """Plot the clearance over the lateral offset in the lower third; return the axes above."""
     above, below = figure.subplots(2, height_ratios=(2.0, 1.0))
-    for bad, style in ((False, {"color": LEFT, "marker": "o"}), (True, {"color": ALARM, "marker": "X"})):
-        some = touched == bad
-        below.plot(across[some], 100 * np.maximum(clearance[some], 0), linestyle="none", markersize=4, **style)
-    below.set(xlabel="obstacle beside the robot's way, d_y [m]", ylabel="least clearance [cm]")
+    for bad, colour, marker in ((False, LEFT_COLOUR, "o"), (True, RED, "X")):
+        x, y = lateral_offsets[touched == bad], 100 * np.maximum(clearance[touched == bad], 0)
+        below.plot(x, y, color=colour, marker=marker, linestyle="none", markersize=4)
+    below.set(xlabel="lateral offset of the obstacle, d_y [m]", ylabel="smallest clearance [cm]")
     below.set_ylim(bottom=0)
     return above
 
 
-def draw_room(axes: Axes, arena: Arena) -> None:
-    """Draw walls and obstacles from above: what hangs overhead in outline, ways of what moves dotted."""
-    x_min, x_max, y_min, y_max = np.asarray(arena.room)
-    axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=INK, linewidth=1.6))
-    for prisms, outline in ((arena.boxes, _box), (arena.cylinders, _disc)):
-        for index in np.flatnonzero(~np.asarray(is_parked(prisms))):
+def add_room(axes: Axes, arena: Arena) -> None:
+    """Add walls and obstacles seen from above: overhead obstacles as dashed outlines, paths of moving ones dotted."""
+    x_min, x_max, y_min, y_max = np.asarray(arena.bounds)
+    axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, fill=False, edgecolor=DARK, linewidth=1.6))
+    for prisms, make_patch in ((arena.boxes, _box), (arena.cylinders, _disc)):
+        for index in np.flatnonzero(~np.asarray(is_inactive(prisms))):
             overhead = bool(is_overhead(prisms)[index])
-            style = {"facecolor": "none" if overhead else OBSTACLE, "linestyle": "--" if overhead else "-"}
-            axes.add_patch(outline(prisms, index, edgecolor=QUIET, linewidth=0.6, **style))
+            patch = make_patch(prisms, index)
+            patch.set(facecolor="none" if overhead else OBSTACLE_COLOUR, linestyle="--" if overhead else "-")
+            patch.set(edgecolor=GREY, linewidth=0.6)
+            axes.add_patch(patch)
             way = np.stack([prisms.centre[index], prisms.goal[index]])
-            axes.plot(*way.T, color=QUIET, linestyle=":", linewidth=0.8)
+            axes.plot(*way.T, color=GREY, linestyle=":", linewidth=0.8)
     margin = 0.03 * max(x_max - x_min, y_max - y_min)
     axes.set(xlim=(x_min - margin, x_max + margin), ylim=(y_min - margin, y_max + margin))
 
 
-def _box(prisms: Prisms, index: int | np.intp, **style: Any) -> Polygon:
+def _box(prisms: Prisms, index: int | np.intp) -> Polygon:
     a, b = np.asarray(prisms.half_size[index])
     cosine, sine = np.cos(prisms.yaw[index]), np.sin(prisms.yaw[index])
     corners = np.array([[a, b], [-a, b], [-a, -b], [a, -b]]) @ np.array([[cosine, sine], [-sine, cosine]])
-    return Polygon(corners + np.asarray(prisms.centre[index]), **style)
+    return Polygon(corners + np.asarray(prisms.centre[index]))
 
 
-def _disc(prisms: Prisms, index: int | np.intp, **style: Any) -> Circle:
-    return Circle(tuple(np.asarray(prisms.centre[index])), float(prisms.half_size[index, 0]), **style)
+def _disc(prisms: Prisms, index: int | np.intp) -> Circle:
+    return Circle(tuple(np.asarray(prisms.centre[index])), float(prisms.half_size[index, 0]))
 
 
-def draw_walks(axes: Axes, walks: Walks, colours: Sequence[str]) -> None:
-    """Draw a path a robot, broken where it was set back, a ring at its start and a cross at each touch."""
-    start = {"marker": "o", "color": INK, "markerfacecolor": "white", "markersize": 4, "linestyle": "none"}
-    touch = {"marker": "X", "color": ALARM, "markeredgecolor": "white", "markersize": 5, "linestyle": "none"}
-    for robot, (positions, setbacks, contact) in enumerate(zip(*walks, strict=True)):
-        cuts = np.flatnonzero(np.diff(setbacks)) + 1
-        for piece in np.split(positions[:, :2], cuts):
-            # A point a quarter of a second is enough for the eye, and keeps the file small.
-            thin = np.concatenate([piece[::8], piece[-1:]])
-            axes.plot(*thin.T, color=colours[robot % len(colours)], linewidth=0.9, alpha=0.85, zorder=3)
-        touched = positions[contact.astype(bool), :2]
-        axes.plot(*touched.T, **touch, zorder=5)
+def add_paths(axes: Axes, paths: Paths, colours: Sequence[str]) -> None:
+    """Add a path per robot, interrupted at resets, with a ring at its start and a cross at each collision."""
+    start = {"marker": "o", "color": DARK, "markerfacecolor": "white", "markersize": 4, "linestyle": "none"}
+    collision = {"marker": "X", "color": RED, "markeredgecolor": "white", "markersize": 5, "linestyle": "none"}
+    for robot, (positions, resets, contact) in enumerate(zip(*paths, strict=True)):
+        for segment in np.split(positions[:, :2], np.flatnonzero(np.diff(resets)) + 1):
+            points = np.concatenate([segment[::POINT_STRIDE], segment[-1:]])
+            axes.plot(*points.T, color=colours[robot % len(colours)], linewidth=0.9, alpha=0.85, zorder=3)
+        axes.plot(*positions[contact.astype(bool), :2].T, **collision, zorder=5)
         axes.plot(*positions[0, :2], **start, zorder=4)
     axes.plot([], [], **start, label="start")
-    axes.plot([], [], **touch, label="touched something, set back")
+    axes.plot([], [], **collision, label="collision, robot reset")
 
 
 @styled
-def drivers(places: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Figure:
-    """Draw collisions per 100 m of every driver in every place, with 95 % intervals.
+def plot_collision_rates(scores: Mapping[str, Mapping[str, JsonObject]]) -> Figure:
+    """Plot collisions per 100 m of every policy in every trial, with 95 % intervals.
 
     Args:
-        places: place -> driver -> score, whose "per_100_m" has value, low, high.
+        scores: title of the trial -> name of the policy -> score, whose "per_100_m" has value, low, high.
     """
-    figure = Figure(figsize=(WIDTH, 0.85 + 0.27 * max(len(scores) for scores in places.values())))
-    panels = np.atleast_1d(figure.subplots(1, len(places)))
-    for axes, (place, scores) in zip(panels, places.items(), strict=True):
-        for row, (name, score) in enumerate(scores.items()):
-            rate, colour = score["per_100_m"], DRIVERS.get(name, QUIET)
+    figure = Figure(figsize=(WIDTH, 0.85 + 0.27 * max(len(policies) for policies in scores.values())))
+    panels = np.atleast_1d(figure.subplots(1, len(scores)))
+    for axes, (trial, policies) in zip(panels, scores.items(), strict=True):
+        for row, (name, score) in enumerate(policies.items()):
+            rate, colour = score["per_100_m"], POLICY_COLOURS.get(name, GREY)
             axes.plot([rate["low"], rate["high"]], [row, row], color=colour, linewidth=2.2)
             axes.plot([rate["value"]], [row], "o", color=colour, markersize=6, clip_on=False, zorder=3)
             axes.annotate(
@@ -179,8 +243,8 @@ def drivers(places: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Figure:
                 fontsize=8,
                 textcoords="offset points",
             )
-        axes.set_yticks(range(len(scores)), list(scores))
-        axes.set(title=place, xlabel="collisions per 100 m", ylim=(len(scores) - 0.5, -0.5))
+        axes.set_yticks(range(len(policies)), list(policies))
+        axes.set(title=trial, xlabel="collisions per 100 m", ylim=(len(policies) - 0.5, -0.5))
         axes.set_xlim(0, 1.14 * axes.get_xlim()[1])
         axes.grid(False, axis="y")
         axes.tick_params(axis="y", length=0)

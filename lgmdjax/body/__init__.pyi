@@ -1,0 +1,2 @@
+from . import hexapod as hexapod
+from . import implicit_step as implicit_step

@@ -1,0 +1,263 @@
+"""Flags of the commands, and the settings that they can change one by one.
+
+The flag of a setting is its path: `--train.epochs`, `--collect.eyes.width`, `--evaluate.tube.seeds` (the plan of a
+trial has the trial's name). Its default is that of the scale, so `--scale` is read before the other flags are known.
+Nothing here imports NumPy or JAX, so that help is printed at once.
+"""
+
+import argparse
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar, get_args
+
+import tyro
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+from lgmdjax.control.names import POLICY_NAMES, PolicyName
+from lgmdjax.errors import InputError
+from lgmdjax.evaluation.settings import TrialName, TrialPlan
+from lgmdjax.pipeline import scales
+from lgmdjax.pipeline.scales import Scale
+from lgmdjax.pipeline.settings import EvaluateSettings
+
+FlagsT = TypeVar("FlagsT")
+MAX_NAME = 200  # characters of the name that a run folder gets from its changed settings
+MAY_BE_ZERO = ("dagger-rounds",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineFlags:
+    """The run folder, and the settings of its stages."""
+
+    scale: Scale = "quick"
+    """smoke runs every stage in minutes, quick shows the result, paper has the settings of the paper"""
+    out: Path = Path("runs")
+    """folder that holds the run folders"""
+    seed: int = 0
+    """seed of all random numbers"""
+    name: str = ""
+    """name of the run folder; if empty, <scale>-<seed> and each setting that is changed: quick-0_train.epochs=200"""
+    settings: Annotated[Mapping[str, object], tyro.conf.arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyFlags:
+    """The robot and the settings of a study."""
+
+    run: Path | None = None
+    """run folder of the robot that is studied; the pretrained robot if left out"""
+    seed: int = 0
+    """seed of all random numbers"""
+    out: Path = Path("runs/studies")
+    """folder that holds the folders of the studies"""
+    name: str = ""
+    """name of the study's folder; if empty, <study>-<seed> and each setting that is changed: velocity-0_robots=4"""
+    settings: object
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialFlags:
+    """The trials, and the robot and policies that run them."""
+
+    trials: tyro.conf.Positional[tuple[TrialName, ...]]
+    """trials of the paper"""
+    policy: tuple[PolicyName | Literal["all"], ...] = ("learned",)
+    """policies that are compared; all stands for the five"""
+    seed: int = 0
+    """seed of rooms, textures and starts"""
+    seeds: int | None = None
+    """number of seeds; if left out that of the trial, which is the number of the paper's repetitions or more"""
+    width: int | None = None
+    """width of the pictures [px], 320 in the paper; if left out that of the robot's training, with similar results"""
+    run: Path | None = None
+    """run folder of the robot; the pretrained robot if left out"""
+    out: Path = Path("runs/trials")
+    """folder that holds one folder for each trial and policy"""
+
+    def policies(self) -> tuple[PolicyName, ...]:
+        """Return the policies that are compared, in the order in which they were given."""
+        names: list[PolicyName] = []
+        for name in self.policy:
+            names.extend(POLICY_NAMES if name == "all" else (name,))
+        return tuple(dict.fromkeys(names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchFlags:
+    """The video, and how the detectors see it."""
+
+    video: tyro.conf.Positional[Path]
+    """any video that FFmpeg reads"""
+    stereo: Literal["side-by-side"] | None = None
+    """each frame holds the pictures of the left and the right eye, side by side"""
+    mono: tyro.conf.FlagCreatePairsOff[bool] = False
+    """each frame is one picture, of which each eye sees its side (the default without --stereo)"""
+    out: Path = Path("runs/watch")
+    """folder that holds one folder for each video"""
+    table: Literal["csv", "parquet"] = "csv"
+    """file format of the responses, one row for each frame"""
+    overlap: float = 0.5
+    """fraction of its picture that each eye sees, from 0.5 (its half) to 1 (all of it)"""
+    width: int = 320
+    """wider pictures are averaged down to this width [px]"""
+    threshold: float | None = None
+    """T_s, threshold of a cell's excitation [grey levels of 255]"""
+    suppression: float | None = None
+    """T_f, mean change of the picture above which the response is suppressed [grey levels]"""
+    inhibition: float | None = None
+    """W_I, weight of the inhibition"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorFlags:
+    """The folder that is checked."""
+
+    out: Path = Path("runs")
+    """folder that run folders would be written to"""
+
+
+NEED_RUN = ("sensitivity", "overlap", "lgmd_gradient")
+"""Studies of recorded walks, which the pretrained robot has none of."""
+
+
+def parse_pipeline(command: str, description: str, arguments: Sequence[str]) -> PipelineFlags:
+    """Read the flags of a pipeline stage, whose settings default to those of the scale."""
+    scale = _read_scale(arguments)
+    preset = scales.SCALES[scale]
+    flags = parse(PipelineFlags(scale=scale, settings=preset), command, description, arguments)
+    settings = {stage: _keep_preset(preset[stage], flags.settings[stage]) for stage in preset}
+    check_settings(settings)
+    for flag, value in changed_settings(preset, settings).items():
+        if flag.endswith(".trial"):
+            raise InputError(f"expected --{flag} as it is, got {value}; change the settings of another trial")
+    name = flags.name or name_run(f"{flags.scale}-{flags.seed}", preset, settings)
+    return PipelineFlags(scale=flags.scale, out=flags.out, seed=flags.seed, name=name, settings=settings)
+
+
+def parse_study(study: str, question: str, arguments: Sequence[str]) -> StudyFlags:
+    """Read the flags of a study, whose settings default to those of scale paper."""
+    preset = {**scales.SCALES["paper"], **scales.STUDY_PRESETS}[study]
+    flags = parse(StudyFlags(settings=preset), f"study {study}", question, arguments)
+    if study in NEED_RUN and flags.run is None:
+        raise InputError(f"expected --run with a run folder for study {study}, which reads recorded walks; got none")
+    settings = _keep_preset(preset, flags.settings)
+    check_settings(settings, "settings")
+    name = flags.name or name_run(f"{study}-{flags.seed}", preset, settings)
+    return StudyFlags(run=flags.run, seed=flags.seed, out=flags.out, name=name, settings=settings)
+
+
+def parse(flags: FlagsT, command: str, description: str, arguments: Sequence[str]) -> FlagsT:
+    """Read flags; those that are not given keep the values of `flags`."""
+    return tyro.cli(
+        type(flags),
+        default=flags,
+        prog=f"lgmdjax {command}",
+        description=description,
+        args=arguments,
+        config=(tyro.conf.AvoidSubcommands,),
+        registry=_REGISTRY,
+    )
+
+
+def parse_trial(description: str, arguments: Sequence[str]) -> TrialFlags:
+    """Read the flags of command trial."""
+    flags = parse(TrialFlags(trials=tyro.MISSING), "trial", description, arguments)
+    if not flags.trials:
+        raise InputError(f"expected one or more trials, got none; choose from {', '.join(get_args(TrialName))}")
+    return flags
+
+
+def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
+    """Read the flags of command watch."""
+    return parse(WatchFlags(video=tyro.MISSING), "watch", description, arguments)
+
+
+def changed_settings(preset: object, settings: object, flag: str = "") -> dict[str, object]:
+    """Return the settings that differ from the preset, by the names of their flags.
+
+    >>> from lgmdjax.pipeline.settings import ReportSettings
+    >>> changed_settings({"report": ReportSettings(video_seconds=10)}, {"report": ReportSettings(video_seconds=5)})
+    {'report.video-seconds': 5}
+    """
+    fields = _fields(preset, settings, flag)
+    if fields is None:
+        return {} if preset == settings else {flag: settings}
+    return {name: value for field in fields for name, value in changed_settings(*field).items()}
+
+
+def name_run(prefix: str, preset: object, settings: object) -> str:
+    """Return the default name of a run folder, which tells its changed settings.
+
+    >>> name_run("quick-0", {"report": 1.0}, {"report": 2.0})
+    'quick-0_report=2'
+    """
+    changed = changed_settings(preset, settings)
+    name = "_".join([prefix, *(f"{flag}={_format(value)}" for flag, value in changed.items())])
+    if len(name) > MAX_NAME:
+        raise InputError("expected a --name for a run with so many changed settings, got none; choose one")
+    return name
+
+
+def check_settings(settings: object, flag: str = "") -> None:
+    """Raise `InputError` for a number that is negative or not finite, or zero where the setting can't be zero."""
+    for _, value, name in _fields(settings, settings, flag) or ():
+        check_settings(value, name)
+    may_be_zero = flag.rpartition(".")[2] in MAY_BE_ZERO
+    for value in settings if isinstance(settings, tuple) else (settings,):
+        if isinstance(value, (int, float)) and not (0 < value < math.inf or (value == 0 and may_be_zero)):
+            least = "0 or more" if may_be_zero else "more than 0"
+            raise InputError(f"expected {least} for --{flag}, got {value}; choose another number")
+
+
+def _fields(preset: object, settings: object, flag: str) -> list[tuple[object, object, str]] | None:
+    """Return (preset, setting, flag) for each part of some settings; None for a setting without parts."""
+    if isinstance(preset, EvaluateSettings) and isinstance(settings, EvaluateSettings):
+        plans = zip(preset.trials, settings.trials, strict=True)
+        return [(before, after, f"{flag}.{before.trial}") for before, after in plans]
+    before, after = (_mapping(each) for each in (preset, settings))
+    if before is None or after is None:
+        return None
+    return [(before[name], after[name], f"{flag}.{name.replace('_', '-')}".lstrip(".")) for name in after]
+
+
+def _mapping(settings: object) -> dict[str, object] | None:
+    if is_dataclass(settings):
+        return dict(vars(settings))
+    return dict(settings) if isinstance(settings, Mapping) else None
+
+
+def _format(value: object) -> str:
+    """Return a value as a part of a file name."""
+    values = value if isinstance(value, tuple) else (value,)
+    text = ",".join(f"{each:.12g}" if isinstance(each, float) else str(each) for each in values)
+    return re.sub(r"[^\w.,+-]", "-", text)
+
+
+def _keep_preset(preset: object, settings: object) -> object:
+    """Return the preset if the settings are equal to it: 10.0 for 10 would be hashed as another setting."""
+    return preset if settings == preset else settings
+
+
+def _read_scale(arguments: Sequence[str]) -> Scale:
+    """Return the scale among the arguments; its default for one that does not exist, which tyro then refuses."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--scale", nargs="?")
+    found = parser.parse_known_args(arguments)[0].scale
+    return found if found in scales.SCALES else PipelineFlags.scale
+
+
+_REGISTRY = ConstructorRegistry()
+
+
+@_REGISTRY.struct_rule
+def _name_plans_by_trial(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Name the flags of stage evaluate's plans by their trials, not by their numbers."""
+    if info.type is not EvaluateSettings:
+        return None
+    plans = tuple(StructFieldSpec(name=plan.trial, type=TrialPlan, default=plan) for plan in info.default.trials)
+    return StructConstructorSpec(
+        instantiate=lambda **plans: EvaluateSettings(trials=tuple(plans.values())), fields=plans
+    )

@@ -1,0 +1,30 @@
+"""`lgmdjax trial`: some policies in some trials, one after the other, and a line about each."""
+
+from collections.abc import Iterator
+
+from lgmdjax.cli.flags import TrialFlags
+from lgmdjax.evaluation import run_trial
+from lgmdjax.runtime import storage
+from lgmdjax.runtime.storage import JsonObject
+
+
+def run_trials(flags: TrialFlags) -> Iterator[str]:
+    """Run every policy in every trial; yield a line about each when it is done."""
+    for trial in flags.trials:
+        for policy in flags.policies():
+            folder = run_trial.run_trial(
+                trial, policy, seed=flags.seed, seeds=flags.seeds, width=flags.width, run=flags.run, out=flags.out
+            )
+            yield f"{trial}, {policy}: {describe(storage.read_json(folder / 'outcome.json'))}; look into {folder}"
+
+
+def describe(outcome: JsonObject) -> str:
+    """Describe the outcome of a trial in a line.
+
+    >>> describe({"per_100_m": {"value": 7.3}, "collisions": 3, "distance": 41.2})
+    '3 collisions in 41 m'
+    """
+    if "per_100_m" in outcome:
+        return f"{outcome['collisions']} collisions in {outcome['distance']:.0f} m"
+    untouched = f"{outcome['untouched']} of {outcome['robots']} untouched"
+    return f"{untouched}; {outcome['passed']} passed, {outcome['retreated']} turned back"

@@ -1,0 +1,5 @@
+from . import braitenberg as braitenberg
+from . import controller as controller
+from . import names as names
+from . import navigator as navigator
+from . import policies as policies

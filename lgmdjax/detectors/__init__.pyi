@@ -1,0 +1,1 @@
+from . import lgmd as lgmd

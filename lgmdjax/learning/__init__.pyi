@@ -1,0 +1,10 @@
+from . import behaviour_cloning as behaviour_cloning
+from . import checkpoints as checkpoints
+from . import dagger as dagger
+from . import finetuning as finetuning
+from . import gait_objective as gait_objective
+from . import lgmd_gradient_fit as lgmd_gradient_fit
+from . import lgmd_grid_search as lgmd_grid_search
+from . import rollout_gradient as rollout_gradient
+from . import sequences as sequences
+from . import settings as settings

@@ -1,0 +1,10 @@
+from . import collect as collect
+from . import evaluate as evaluate
+from . import fit_gait as fit_gait
+from . import report as report
+from . import report_data as report_data
+from . import report_figures as report_figures
+from . import scales as scales
+from . import settings as settings
+from . import stages as stages
+from . import train as train

@@ -1,0 +1,5 @@
+from . import detection as detection
+from . import learning as learning
+from . import locomotion as locomotion
+from . import style as style
+from . import trajectories as trajectories

@@ -1,0 +1,10 @@
+"""MJX, imported without the two lines that it prints where its optional back end (Warp) is not installed."""
+
+import contextlib
+import io
+
+with contextlib.redirect_stdout(io.StringIO()):
+    import mujoco.mjx as mjx
+    from mujoco.mjx._src.solver import Context as Context
+
+__all__ = ["Context", "mjx"]

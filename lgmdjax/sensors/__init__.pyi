@@ -1,0 +1,9 @@
+from . import antialiasing as antialiasing
+from . import camera as camera
+from . import compositing as compositing
+from . import fusion as fusion
+from . import hemifield as hemifield
+from . import laser as laser
+from . import settings as settings
+from . import silhouettes as silhouettes
+from . import stimuli as stimuli

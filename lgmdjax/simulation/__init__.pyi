@@ -1,0 +1,9 @@
+from . import assembly as assembly
+from . import closed_loop as closed_loop
+from . import episodes as episodes
+from . import recording as recording
+from . import rerender as rerender
+from . import rollout as rollout
+from . import room_batches as room_batches
+from . import settings as settings
+from . import sharding as sharding

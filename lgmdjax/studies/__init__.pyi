@@ -1,0 +1,11 @@
+from . import closed_loop_finetune as closed_loop_finetune
+from . import errata as errata
+from . import failure_modes as failure_modes
+from . import gait_gradient as gait_gradient
+from . import gradient_horizon as gradient_horizon
+from . import lgmd_gradient as lgmd_gradient
+from . import overlap as overlap
+from . import sensitivity as sensitivity
+from . import settings as settings
+from . import supervision as supervision
+from . import velocity as velocity

@@ -1,0 +1,5 @@
+from . import arena as arena
+from . import obstacles as obstacles
+from . import raycast as raycast
+from . import scenes as scenes
+from . import texture as texture
