@@ -1,0 +1,33 @@
+__version__: str
+
+from . import body as body
+from . import cli as cli
+from . import control as control
+from . import detectors as detectors
+from . import evaluation as evaluation
+from . import learning as learning
+from . import locomotion as locomotion
+from . import pipeline as pipeline
+from . import reporting as reporting
+from . import runtime as runtime
+from . import sensors as sensors
+from . import simulation as simulation
+from . import studies as studies
+from . import world as world
+from .body import hexapod as hexapod
+from .control import braitenberg as braitenberg
+from .control import navigator as navigator
+from .detectors import lgmd as lgmd
+from .errors import InputError as InputError
+from .evaluation.metrics import score as score
+from .evaluation.run_trial import run_trial as run_trial
+from .locomotion import cpg as cpg
+from .reporting.figures.trajectories import plot_walks as plot_walks
+from .reporting.walk_video import write_video as write_video
+from .sensors import camera as camera
+from .sensors import laser as laser
+from .simulation.assembly import load_robot as load_robot
+from .simulation.closed_loop import Record as Record
+from .simulation.closed_loop import Room as Room
+from .simulation.recording import rollout as rollout
+from .simulation.room_batches import random_rooms as random_rooms
