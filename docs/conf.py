@@ -19,7 +19,7 @@ nb_execution_mode = "off"  # the notebooks carry their outputs, which a test kee
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # shapes stand in the source and in the docstrings
-autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True, "undoc-members": True, "exclude-members": "Context"}  # MJX's own class
 napoleon_google_docstring = True
 add_module_names = False
 
