@@ -13,10 +13,10 @@ class CameraSettings:
     """
 
     width: int
-    """px"""
+    """width of each eye's image [px]"""
     height: int
-    """px"""
+    """height of each eye's image [px]"""
     overlap: float = 0.5
-    """Fraction of the width that each LGMD receives, from its own side."""
+    """fraction of the width that each LGMD receives, from its own side: 0.5 to 1"""
     pooling: int = 1
-    """px"""
+    """width of a detector's cell [px]"""
