@@ -34,8 +34,9 @@ test: setup
 	'$(VENV)/bin/python' -m pytest $(ARGS)
 
 # The tests compile with other flags than users do, to save time; contracts, gradients, images and symmetry with both.
+# The slow ones of them are left out: they would add ten minutes.
 test-default-xla: setup
-	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m default_xla $(ARGS)
+	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m 'default_xla and not slow' $(ARGS)
 
 # Lines that the tests reach, as a table and in build/coverage; needs half again as long as `make test`.
 coverage: setup
