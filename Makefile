@@ -34,7 +34,7 @@ test: setup
 	'$(VENV)/bin/python' -m pytest $(ARGS)
 
 # The tests compile with other flags than users do, to save time; contracts, gradients, images and symmetry with both.
-# The slow ones of them are left out: they would add ten minutes.
+# The slow ones of them are left out: their programs take longer to compile than all the others.
 test-default-xla: setup
 	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m 'default_xla and not slow' $(ARGS)
 
