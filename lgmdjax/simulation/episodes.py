@@ -252,13 +252,14 @@ def _tables(folder: Path, parameters: JsonObject | None) -> list[pa.Table]:
     for number, path in enumerate(_files(folder)):
         if path.name != f"chunk-{number:05d}.parquet":
             raise InputError(f"{folder}: expected chunk-{number:05d}.parquet, got {path.name}; a chunk is missing")
-        found = _header(path)["parameters"]
+        header = _header(path)
+        found = header["parameters"]
         expected = found if expected is None else expected
         if found != expected:
             raise InputError(
                 f"{path}: expected walks of the same settings, got {_differences(expected, found)}; use another folder"
             )
-        tables.append(_read(path))
+        tables.append(_read(path, RENAMED[header["version"]]))
     return tables
 
 
@@ -279,9 +280,8 @@ def _header(path: Path) -> JsonObject:
     return header
 
 
-def _read(path: Path) -> pa.Table:
+def _read(path: Path, renamed: Mapping[str, str]) -> pa.Table:
     """Return the columns of a chunk under their present names."""
-    renamed = RENAMED[_header(path)["version"]]
     try:
         table = pq.read_table(path, page_checksum_verification=True)
     except (OSError, pa.ArrowException) as error:

@@ -64,11 +64,6 @@ def stack_rooms(rooms: list[Room]) -> Room:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
 
 
-def concatenate_rooms(first: Room, second: Room) -> Room:
-    """Concatenate two batches of rooms."""
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
-
-
 def training_rooms(seed: int, episode: int, robots: int) -> Room:
     """Return the random rooms of a training episode, with contrasts in `CONTRAST_RANGE`.
 
