@@ -1,11 +1,11 @@
-# make setup | reproduce | test | test-default-xla | coverage | docs | lint | clean   (PYTHON=... and VENV=... choose another interpreter, another place)
+# make setup | reproduce | test | coverage | docs | lint | clean   (PYTHON=... and VENV=... choose another interpreter, another place)
 
 VENV ?= .venv
 SCALE ?= quick
 SEED ?= 0
 .DEFAULT_GOAL := setup
 .DELETE_ON_ERROR:
-.PHONY: setup reproduce test test-default-xla coverage docs lint clean lock
+.PHONY: setup reproduce test coverage docs lint clean lock
 
 # The first interpreter that runs and is new enough; a name alone proves nothing (version managers leave shims).
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -30,13 +30,15 @@ $(VENV)/.ready: $(VENV)/.locked pyproject.toml
 reproduce: setup
 	'$(VENV)/bin/lgmdjax' reproduce --scale $(SCALE) --seed $(SEED)
 
+# Contracts, gradients, images and symmetry are compiled as users compile them; all other tests with other flags, which
+# saves time. With ARGS, such as a file, all tests that it names run at once.
 test: setup
+ifdef ARGS
 	'$(VENV)/bin/python' -m pytest $(ARGS)
-
-# The tests compile with other flags than users do, to save time; contracts, gradients, images and symmetry with both.
-# The slow ones of them are left out: their programs take longer to compile than all the others.
-test-default-xla: setup
-	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m 'default_xla and not slow' $(ARGS)
+else
+	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m default_xla
+	'$(VENV)/bin/python' -m pytest -m 'not default_xla'
+endif
 
 # Lines that the tests reach, as a table and in build/coverage; needs half again as long as `make test`.
 coverage: setup

@@ -1,7 +1,7 @@
 """Settings of all tests: double precision, checked shapes, a compilation cache that outlives the run.
 
-Set LGMDJAX_TEST_DEFAULT_XLA=1 to compile with XLA's default flags, as users do; `make test-default-xla` runs the tests
-that are marked `default_xla` so.
+Set LGMDJAX_TEST_DEFAULT_XLA=1 to compile with XLA's default flags, as users do. `make test` does so for the tests that
+are marked `default_xla`, and runs the others without it.
 """
 
 import os
@@ -20,8 +20,9 @@ if not DEFAULT_XLA:
     # Most of the tests' time is compilation, which takes a third less with XLA's older code generator. Its programs
     # render images more slowly, but tests render few.
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
-# Tests that also run with the default flags: these files, and all tests of mirror symmetry.
-DEFAULT_XLA_FILES = ("test_contract.py", "test_gradients.py", "test_rollout_gradient.py", "test_camera.py")
+# Tests that run with the default flags: these files, all tests of mirror symmetry, and the gradient of the closed loop
+# through the controller. Its gradients through body and eyes take longer to compile so than all of these.
+DEFAULT_XLA_FILES = ("test_contract.py", "test_gradients.py", "test_camera.py", "test_behaviour.py")
 
 import jax
 import jaxtyping

@@ -10,6 +10,16 @@ from lgmdjax.body import hexapod
 from lgmdjax.locomotion import kinematics, tripod_gait
 
 
+@pytest.fixture(scope="module")
+def body():
+    return hexapod.load()
+
+
+@pytest.fixture(scope="module")
+def geometry(body):
+    return kinematics.read_geometry(body)
+
+
 def test_forward_kinematics_equal_mujoco(body, geometry):
     data = mujoco.MjData(body)
     feet = [body.site(f"{leg}_foot").id for leg in hexapod.LEGS]

@@ -5,10 +5,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lgmdjax.body import hexapod
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
 
 TRIPODS = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.5])
 VELOCITIES = np.linspace(shaping.MIN_VELOCITY, shaping.MAX_VELOCITY, 7)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return hexapod.load()
+
+
+@pytest.fixture(scope="module")
+def geometry(body):
+    return kinematics.read_geometry(body)
 
 
 @pytest.fixture(scope="module")
