@@ -19,7 +19,7 @@ from lgmdjax.simulation.rollout import concatenate_time, rollout_chunks
 from lgmdjax.simulation.room_batches import benchmark_rooms
 from lgmdjax.simulation.settings import BenchmarkRooms
 
-BATCH_SIZE = 16  # robots that are rolled out at once
+BATCH_SIZES = (4, 16)  # robots that are rolled out at once: two compiled programs serve any number
 CHUNK_SECONDS = 5.0  # s of robot time between two updates of the progress bar
 PROGRESS_FORMAT = "{desc}: {percentage:3.0f} % |{bar}| {n:.0f}/{total:.0f} robot-s [{elapsed}<{remaining}, {rate_fmt}]"
 
@@ -98,13 +98,13 @@ def rollout_in_batches(
     render: bool = True,
     skip_batches: int = 0,
 ) -> Iterator[tuple[list[int], closed_loop.Record]]:
-    """Roll out any number of robots in batches of `BATCH_SIZE`, yielding indices of robots and their record.
+    """Roll out any number of robots in batches of one of `BATCH_SIZES`, yielding indices of robots and their record.
 
     Batches of one size share one compiled program: the last one is padded with its last robot, which is cut from the
     record. The first `skip_batches` are left out.
     """
     robots = rooms.starts.shape[0]
-    size = min(BATCH_SIZE, robots)
+    size = _batch_size(robots)
     for first in range(skip_batches * size, robots, size):
         present = list(range(first, min(first + size, robots)))
         padded = np.minimum(np.arange(first, first + size, dtype=np.int32), robots - 1)
@@ -158,7 +158,12 @@ def record_rollouts(
 
 def is_recorded(folder: Path, robots: int) -> bool:
     """Return whether a folder of `record_rollouts` has all batches of this number of robots."""
-    return len(list(folder.glob("chunk-*.parquet"))) * min(BATCH_SIZE, robots) >= robots
+    return len(list(folder.glob("chunk-*.parquet"))) * _batch_size(robots) >= robots
+
+
+def _batch_size(robots: int) -> int:
+    """Return the smallest size of a batch with a place for every robot, or the largest."""
+    return next((size for size in BATCH_SIZES if robots <= size), BATCH_SIZES[-1])
 
 
 def record_benchmark(

@@ -43,7 +43,7 @@ def run_dagger(monkeypatch):
         robot = closed_loop.assemble(assembly.make_policies())
         return dagger.run(folder, robot, recorded, SETTINGS, seed=0), list(seen)
 
-    monkeypatch.setattr(recording, "BATCH_SIZE", 2)
+    monkeypatch.setattr(recording, "BATCH_SIZES", (2,))
     monkeypatch.setattr(recording, "rollout_with_progress", rollout)
     monkeypatch.setattr(behaviour_cloning, "fit", fit)
     monkeypatch.setattr(behaviour_cloning, "rescale_turns", lambda params, walks: params)

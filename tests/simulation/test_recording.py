@@ -42,7 +42,7 @@ def calls(monkeypatch):
             yield jax.tree.map(lambda leaf, half=half: leaf[:, half], synthetic.walk(robots, FRAMES, position=position))
 
     monkeypatch.setattr(recording, "rollout_with_progress", stand)
-    monkeypatch.setattr(recording, "BATCH_SIZE", 2)
+    monkeypatch.setattr(recording, "BATCH_SIZES", (2,))
     return made
 
 
@@ -59,6 +59,15 @@ def test_rollout_returns_one_record_of_all_robots(robot, rooms, calls, policy, r
 def test_rollout_renders_on_demand(robot, rooms, calls):
     recording.rollout(robot, rooms, seconds=1.0, policy="blind", render=True)
     assert calls[0] == ("blind", True, 2)
+
+
+@pytest.mark.parametrize(("robots", "sizes"), [(1, [2]), (2, [2]), (3, [4]), (5, [4, 4])])
+def test_few_robots_get_a_small_batch(robot, rooms, calls, monkeypatch, robots, sizes):
+    monkeypatch.setattr(recording, "BATCH_SIZES", (2, 4))
+    some = jax.tree.map(lambda leaf: leaf[:robots], rooms)
+    record = recording.rollout(robot, some, seconds=1.0)
+    assert [size for *_, size in calls] == sizes
+    np.testing.assert_array_equal(record.position[:, 0, 0], np.arange(robots))
 
 
 @pytest.mark.usefixtures("unchecked")
