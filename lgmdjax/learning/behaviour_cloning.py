@@ -338,13 +338,23 @@ def _require_sound(settings: Settings, train: Sequence[Walk], test: Sequence[Wal
 
 
 def _identity(initial: Progress, data: tuple[SequenceBatch, SequenceBatch], settings: Settings) -> JsonObject:
-    """Return what distinguishes this fit from any other: its settings, data and initial weights."""
+    """Return what distinguishes this fit from any other: its settings, data and initial weights.
+
+    Of the weights only the signs count. Their last digits depend on the processor, since some are made orthogonal by a
+    matrix decomposition, and a fit may be continued on another machine.
+    """
 
     def digest(tree: PyTree) -> str:
         leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(tree)]
         return hashlib.sha256(b"".join(leaves)).hexdigest()
 
+    signs = jax.tree.map(lambda leaf: np.packbits(np.signbit(leaf)), initial.weights)
+
     names = asdict(settings)
     names["told"] = names.pop("command_feedback")  # its name on disk
-    hashes = {"training data": digest(data[0]), "test data": digest(data[1]), "first weights": digest(initial.weights)}
+    hashes = {
+        "training data": digest(data[0]),
+        "test data": digest(data[1]),
+        "signs of the first weights": digest(signs),
+    }
     return names | hashes

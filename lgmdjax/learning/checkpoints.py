@@ -84,7 +84,8 @@ class Checkpoints:
         self.manager.close()
 
     def _require_same_identity(self, found: JsonObject) -> None:
-        names = sorted(name for name in self.identity if found.get(name) != self.identity[name])
+        # A name that only one of both has belongs to another version of the package.
+        names = sorted(name for name in self.identity.keys() & found.keys() if found[name] != self.identity[name])
         if names:
             raise InputError(
                 f"{self.folder}: expected checkpoints of the same fit, got another {', '.join(names)}; "

@@ -41,6 +41,7 @@ def walk(seed, frames, room=0):
         feed_forward=zeros,
         excitation=zeros,
         distances=zeros,
+        corridor=zeros,
         label=label,
         velocity=label,
         clearance=np.ones(frames),
@@ -212,7 +213,7 @@ def test_checkpoints_of_another_fit_and_damaged_ones_are_refused(data, tmp_path)
     fit()
     others: list[tuple[str, dict[str, Any]]] = [
         ("another epochs", {"epochs": 3}),
-        ("another first weights", {"params": navigator.create(jax.random.key(0), "feed-forward")}),
+        ("another signs of the first weights", {"params": navigator.create(jax.random.key(0), "feed-forward")}),
         ("training data", {"train": train[1:]}),
     ]
     for match, changes in others:
