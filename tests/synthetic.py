@@ -47,7 +47,7 @@ def walk(robots: int = 2, frames: int = 1200, **changes: np.ndarray) -> Record:
         "quaternion": np.broadcast_to([1.0, 0, 0, 0], (robots, frames, 4)),
         "joints": np.zeros((robots, frames, 6, 3)),
         **{name: np.zeros((robots, frames, 2)) for name in ("u", "feed_forward", "excitation")},
-        **{name: np.zeros((robots, frames, 2)) for name in ("distances", "label", "velocity")},
+        **{name: np.zeros((robots, frames, 2)) for name in ("distances", "corridor", "label", "velocity")},
         "clearance": np.full((robots, frames), 0.3),
         "contact": np.zeros((robots, frames), bool),
         "is_first": np.zeros((robots, frames), bool),
@@ -86,6 +86,17 @@ def score(rate: float) -> dict:
         "clearance": estimate(0.31),
         "speed": 0.0587,
         "turning": 0.113,
+        "progress": progress(),
+    }
+
+
+def progress() -> dict:
+    """The JSON of `metrics.progress`."""
+    return {
+        "coverage": {"value": 18.2, "low": 17.1, "high": 19.4},
+        "hard_turning": {"value": 0.12, "low": 0.1, "high": 0.14},
+        "net_rotation": {"value": 0.7, "low": 0.6, "high": 0.8},
+        "longest_rotation": 1.3,
     }
 
 
@@ -111,6 +122,7 @@ def rows_of(study: str) -> list[dict]:
             "untouched": 9,
             "robots": 12,
             "passed": 6,
+            "passing": asdict(metrics.wilson_proportion(6, 12)),
             "retreated": 2,
         }
         walls = [{"trial": "white", "contrast": c, "policy": "learned"} | away for c in (0.0, 0.5)]
@@ -165,6 +177,9 @@ def write_experiments(run: Path) -> Path:
         "seconds": [20.0] * 30,
     }
     outcome["avoided"] = asdict(metrics.wilson_proportion(29, 30))
+    outcome["passing"] = asdict(metrics.wilson_proportion(25, 30))
+    outcome["made_good"] = {"value": 0.04, "low": 0.03, "high": 0.05}
+    outcome["progress"] = progress()
     evaluation["tube"] = dict.fromkeys(("teacher", "learned", "blind"), outcome)
     _json(run / "evaluate" / "evaluation.json", evaluation)
     (run / "evaluate" / "tube.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
@@ -305,7 +320,7 @@ def _write_train(folder: Path, generator: np.random.Generator) -> None:
     np.savez(
         folder / "prediction.npz",
         time=time,
-        distances=distances,
+        corridor=distances,
         label=label,
         u=0.5 + 0.3 / distances / 2 + np.abs(generator.normal(0, 0.02, (900, 2))),
         predicted=label + generator.normal(0, 0.08, label.shape),

@@ -76,7 +76,7 @@ def observations(_: np.random.Generator) -> policies.Observation:
     """Responses that command velocities within the gait's range, including both of its ends."""
     u = jnp.asarray([[0.52, 0.55], [0.9, 0.55], [0.6, 0.7], [0.8, 0.85]], dtype=float)
     zero = jnp.zeros_like(u)
-    return policies.Observation(u=u, feed_forward=zero, excitation=zero, distances=zero)
+    return policies.Observation(u=u, feed_forward=zero, excitation=zero, distances=zero, corridor=zero)
 
 
 def policy_component(
@@ -119,8 +119,8 @@ COMPONENTS = (
         braitenberg.step,
         # Near and far distances, so that the tie-break and all limits but the lowest velocity apply.
         lambda rng: jnp.asarray([[0.7, 0.8], [0.8, 4.0], [1.5, 2.0], [0.66, 0.61]], dtype=float),
-        # A limit that does not apply, comparisons, a choice.
-        zero_gradient=("min_velocity", "tie_tolerance", "turn_deadband", "default_side"),
+        # A limit that does not apply, comparisons, a choice, and what the step does not use.
+        zero_gradient=("min_velocity", "tie_tolerance", "turn_deadband", "default_side", "corridor"),
     ),
     *(
         Component(
@@ -152,6 +152,7 @@ COMPONENTS = (
             "tie_tolerance",
             "turn_deadband",
             "default_side",
+            "corridor",
         ),
     ),
     policy_component(

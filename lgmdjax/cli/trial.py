@@ -21,10 +21,12 @@ def run_trials(flags: TrialFlags) -> Iterator[str]:
 def describe(outcome: JsonObject) -> str:
     """Describe the outcome of a trial in a line.
 
-    >>> describe({"per_100_m": {"value": 7.3}, "collisions": 3, "distance": 41.2})
-    '3 collisions in 41 m'
+    >>> progress = {"coverage": {"value": 18.21}}
+    >>> describe({"per_100_m": {"value": 7.3}, "collisions": 3, "distance": 41.2, "progress": progress})
+    '3 collisions in 41 m, 18.2 new cells a minute'
     """
     if "per_100_m" in outcome:
-        return f"{outcome['collisions']} collisions in {outcome['distance']:.0f} m"
+        coverage = outcome["progress"]["coverage"]["value"]
+        return f"{outcome['collisions']} collisions in {outcome['distance']:.0f} m, {coverage:.1f} new cells a minute"
     untouched = f"{outcome['untouched']} of {outcome['robots']} untouched"
     return f"{untouched}; {outcome['passed']} passed, {outcome['retreated']} turned back"

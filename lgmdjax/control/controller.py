@@ -96,6 +96,7 @@ def step(
         feed_forward=response.feed_forward,
         excitation=response.excitation,
         distances=jnp.zeros(2),
+        corridor=jnp.zeros(2),
     )
     state = decide(params, state, observation, policy)
     return move(params, state, interval)

@@ -32,12 +32,13 @@ GAIT_RANGE = braitenberg.Params()  # of which `limit` reads the range of the gai
 
 @struct.dataclass(kw_only=True)
 class Observation:
-    """What a policy may use in one frame: outputs of the two LGMDs and distances in the two hemifields, left first."""
+    """What a policy may use in one frame: outputs of the two LGMDs and distances on either side, left first."""
 
     u: Float[Array, "2"]  # LGMD output, 0.5..1
     feed_forward: Float[Array, "2"]  # FF cell, grey
     excitation: Float[Array, "2"]  # U / n_cell, grey
-    distances: Float[Array, "2"]  # nearest obstacle, m
+    distances: Float[Array, "2"]  # to the nearest obstacle, m
+    corridor: Float[Array, "2"]  # to the nearest obstacle in the way, m
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ class ReplayParams:
 def _step_teacher(
     params: braitenberg.Params, state: braitenberg.State, observation: Observation
 ) -> tuple[braitenberg.State, Float[Array, "2"]]:
-    return braitenberg.step(params, state, observation.distances)
+    distances = braitenberg.sensed_distances(params, observation.distances, observation.corridor)
+    return braitenberg.step(params, state, distances)
 
 
 def _step_learned(

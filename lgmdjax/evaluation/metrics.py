@@ -1,14 +1,22 @@
-"""Metrics of recorded walks: distance, collisions per 100 m, clearance, each with a 95 % interval.
+"""Metrics of recorded walks: does a robot avoid obstacles, and does it go on? Each with a 95 % interval.
 
 Distance is the path length of the trunk's centre. The path is averaged over one gait cycle, so that sway doesn't count,
 and is interrupted at resets. A collision is a frame in which the clearance reached zero. The robot is then reset, so
 each contact counts once.
 
-| quantity                       | interval                                     |
-| ------------------------------ | -------------------------------------------- |
-| collisions per 100 m           | exact, of a Poisson count (Garwood 1936)     |
-| proportion of trials           | Wilson's (Wilson 1927)                       |
-| mean clearance, mean distance  | percentile bootstrap over robots             |
+A robot that turns on the spot has no collision. What tells it from one that avoids obstacles and goes on (`Progress`):
+
+| quantity        | unit  | meaning                                                                              |
+| --------------- | ----- | ------------------------------------------------------------------------------------ |
+| coverage        | 1/min | new cells of 0.25 x 0.25 m that the trunk's centre enters; a reset begins a new count |
+| hard turning    | 1     | share of time with a yaw rate, averaged over 1 s, above 0.15 rad/s                    |
+| net rotation    | turns | largest difference of two headings of one robot between two resets                    |
+
+| quantity                                   | interval                                 |
+| ------------------------------------------ | ---------------------------------------- |
+| collisions per 100 m                       | exact, of a Poisson count (Garwood 1936) |
+| proportion of trials                       | Wilson's (Wilson 1927)                   |
+| means over robots                          | percentile bootstrap over robots         |
 
 Works on host records (`rollout.rollout_chunks`) with axes (robot, frame).
 """
@@ -29,6 +37,9 @@ from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
 
 CONFIDENCE = 0.95
 AVERAGING_TIME = cpg.CYCLE_TIME  # s; u and the commands are averaged over one gait cycle
+CELL = 0.25  # m, side of the cells that coverage counts
+HARD_TURN_RATE = 0.15  # rad/s; a robot that turns faster is turning hard
+HARD_TURN_TIME = 1.0  # s, over which that yaw rate is averaged
 
 
 @struct.dataclass(kw_only=True)
@@ -48,6 +59,16 @@ class Estimate:
 
 
 @struct.dataclass(kw_only=True)
+class Progress:
+    """Whether robots go on: how much floor they see, and how much they turn; means over robots."""
+
+    coverage: Estimate  # 1/min, new cells of `CELL`
+    hard_turning: Estimate  # share of time
+    net_rotation: Estimate  # turns
+    longest_rotation: float  # turns, the largest net rotation of all robots
+
+
+@struct.dataclass(kw_only=True)
 class Score:
     """Metrics of a batch of walks with one policy."""
 
@@ -60,6 +81,7 @@ class Score:
     clearance: Estimate  # m, mean over frames of the smallest clearance within the frame
     speed: float  # m/s, path length over time
     turning: float  # rad/s, mean absolute yaw rate
+    progress: Progress
 
 
 def score(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Score:
@@ -88,7 +110,61 @@ def score(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Score:
         clearance=bootstrap_mean(np.nanmean(clearance, axis=1)),
         speed=distance * FRAME_RATE / int(ok.sum()),
         turning=float(np.mean(np.abs(yaw_rates(record, cycle_time))[ok])),
+        progress=progress(record, cycle_time),
     )
+
+
+def progress(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Progress:
+    """Measure whether robots go on; frames with `ok` false don't count, nor do robots without any other.
+
+    Args:
+        record: recorded walks, axes (robot, frame).
+        cycle_time: duration of one gait cycle [s], over which paths and headings are averaged.
+
+    Raises InputError if no frame counts.
+    """
+    ok = np.asarray(record.ok)
+    frames = ok.sum(axis=1)
+    if not frames.any():
+        raise InputError("expected walks with frames that count, got none; did every robot fall at once?")
+    walked = frames > 0
+    frames = frames[walked]
+    is_hard = (np.abs(yaw_rates(record, HARD_TURN_TIME)) > HARD_TURN_RATE) & ok
+    rotation = net_rotations(record, cycle_time)[walked]
+    return Progress(
+        coverage=bootstrap_mean(count_cells(record, cycle_time)[walked] * FRAME_RATE * 60 / frames),
+        hard_turning=bootstrap_mean(is_hard.sum(axis=1)[walked] / frames),
+        net_rotation=bootstrap_mean(rotation),
+        longest_rotation=float(rotation.max()),
+    )
+
+
+def count_cells(record: Record, cycle_time: float) -> Int[ndarray, " robots"]:
+    """Count the cells of `CELL` that each robot's averaged path enters, anew after each reset."""
+    positions, ok = np.asarray(record.position)[..., :2], np.asarray(record.ok)
+    cells = np.zeros(len(ok), int)
+    for robot, first, end in segment_bounds(np.asarray(record.resets)):
+        path = positions[robot, first:end][ok[robot, first:end]]
+        if len(path):
+            averaged = _average_over_cycle(path, cycle_time)
+            cells[robot] += len(np.unique(np.floor(averaged / CELL), axis=0))
+    return cells
+
+
+def net_rotations(record: Record, cycle_time: float) -> Float[ndarray, " robots"]:
+    """Compute the largest difference [turns] of two headings of each robot, averaged over a cycle, between two resets.
+
+    A robot that turns on the spot has the number of its turns; one that turns to either side in alternation has less
+    than half a turn, however often it turns.
+    """
+    headings, ok = geometry.yaw(np.asarray(record.quaternion, dtype=float)), np.asarray(record.ok)
+    rotation = np.zeros(len(ok))
+    for robot, first, end in segment_bounds(np.asarray(record.resets)):
+        heading = np.unwrap(headings[robot, first:end][ok[robot, first:end]])
+        if len(heading):
+            turns = np.ptp(_average_over_cycle(heading, cycle_time)) / (2 * np.pi)
+            rotation[robot] = max(rotation[robot], turns)
+    return rotation
 
 
 def step_lengths(record: Record, cycle_time: float) -> Float[ndarray, "robots frames"]:

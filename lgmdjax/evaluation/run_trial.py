@@ -158,7 +158,10 @@ def summarise(trial: trials.Trial, record: Record) -> JsonObject:
         "untouched": int((~outcome.touched).sum()),
         "avoided": asdict(outcome.avoided()),
         "passed": int(outcome.passed.sum()),
+        "passing": asdict(outcome.passing()),
         "retreated": int(outcome.retreated.sum()),
+        "made_good": asdict(metrics.bootstrap_mean(outcome.made_good)),
+        "progress": asdict(metrics.progress(trials.until_end(record, outcome))),
         "clearance": outcome.clearance.tolist(),
         "seconds": (outcome.frames / FRAME_RATE).tolist(),
     }

@@ -6,7 +6,9 @@ from typing import Literal
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
 from lgmdjax.sensors.settings import CameraSettings
 
-TrialName = Literal["testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "white", "corner"]
+TrialName = Literal[
+    "testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "gap", "gap-70cm", "gap-60cm", "white", "corner"
+]
 """The trials of `lgmdjax.evaluation.trials`, in the order of its `TRIALS`."""
 
 

@@ -8,6 +8,7 @@
 | indoor   | figs. 15a, 16a    | a box ahead, one to the right, a table to the left             |
 | outdoor  | fig. 15b          | trees and bushes on grass, a facade behind them                |
 | dynamic  | figs. 15c, 16b, c | boxes that move in from the left, then from the right          |
+| gap      | -                 | two boxes ahead, 0.8 m apart; also 0.7 m and 0.6 m             |
 | white    | sec. 5.4          | a wall without contrast ahead                                  |
 | corner   | sec. 5.4          | a corner of two walls ahead                                    |
 
@@ -15,8 +16,8 @@ In `testing` and `unseen` a robot that touches something is reset and walks on; 
 per 100 m (`lgmdjax.evaluation.metrics`). In the other trials the result is whether the robot touched anything. They end
 when it has touched something, has passed the obstacle, or the time is up; a robot that turns back walks on until then.
 
-Each seed samples textures and the exact start pose, which is off by up to a centimetre and two degrees. The textures'
-random key is used by no training room. Every second seed mirrors the room.
+Each seed samples textures and the exact start pose, which is off by up to a centimetre and two degrees, before a gap by
+up to 0.2 m and 15 degrees. The textures' random key is used by no training room. Every second seed mirrors the room.
 """
 
 from collections.abc import Callable
@@ -32,13 +33,14 @@ from lgmdjax import geometry
 from lgmdjax.evaluation.metrics import Estimate, wilson_proportion
 from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.simulation import room_batches
-from lgmdjax.simulation.closed_loop import Record, Room
+from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena, scenes
 
 LATERAL_OFFSETS = tuple(round(0.03 * k, 2) for k in range(15))  # d_y of fig. 14 [m]
 TUBE_DISTANCE = 1.25  # d_x of fig. 14 [m]
 TRIAL_EPISODE = 2**22  # folded into the seed's key; far from the episode numbers of a run, whose rooms therefore differ
 START_JITTER = (0.01, 0.01, np.deg2rad(2.0))  # largest offset of a start pose: x, y [m], yaw [rad]
+GAP_JITTER = (0.2, 0.2, np.deg2rad(15.0))  # the same before a gap
 TURN_BACK_ANGLE = 0.5 * np.pi  # rad from the first heading
 
 
@@ -68,10 +70,15 @@ class Outcome:
     clearance: Float[ndarray, " robots"]  # m, smallest until the end
     passed: Bool[ndarray, " robots"]  # passed the obstacle without contact
     retreated: Bool[ndarray, " robots"]  # turned back without contact, and did not pass
+    made_good: Float[ndarray, " robots"]  # m/s, distance towards what is behind the obstacle over time
 
     def avoided(self) -> Estimate:
         """Estimate the proportion of robots without contact, with Wilson's interval."""
         return wilson_proportion(int((~self.touched).sum()), len(self.touched))
+
+    def passing(self) -> Estimate:
+        """Estimate the proportion of robots that passed the obstacle, with Wilson's interval."""
+        return wilson_proportion(int(self.passed.sum()), len(self.passed))
 
 
 def find_outcome(trial: Trial, record: Record) -> Outcome:
@@ -93,14 +100,24 @@ def find_outcome(trial: Trial, record: Record) -> Outcome:
         clearance=np.where(until_end, record.clearance, np.inf).min(axis=1),
         passed=passed,
         retreated=(has_turned & until_end).any(axis=1) & ~touched & ~passed,
+        made_good=(x[at_end] - x[:, 0]) * FRAME_RATE / (end + 1),
     )
 
 
-def _repeat_scene(scene: Callable[[Array], arena.Arena]) -> Callable[[Array, int], Room]:
+def until_end(record: Record, outcome: Outcome) -> Record:
+    """Return the walks with `ok` false in the frames after the end of each robot's trial."""
+    frames = np.arange(np.shape(record.ok)[1])
+    return replace(record, ok=np.asarray(record.ok) & (frames < outcome.frames[:, None]))
+
+
+def _repeat_scene(
+    scene: Callable[[Array], arena.Arena], jitter: tuple[float, float, float] = START_JITTER
+) -> Callable[[Array, int], Room]:
     """Return a function that builds a scene once per seed, every second time mirrored."""
 
     def make_rooms(key: Array, seeds: int) -> Room:
-        return room_batches.stack_rooms([_room(scene, jax.random.fold_in(key, n), bool(n % 2)) for n in range(seeds)])
+        keys = [jax.random.fold_in(key, n) for n in range(seeds)]
+        return room_batches.stack_rooms([_room(scene, key, bool(n % 2), jitter) for n, key in enumerate(keys)])
 
     return make_rooms
 
@@ -116,13 +133,18 @@ def _tube_rooms(key: Array, seeds: int) -> Room:
     return room_batches.stack_rooms(rooms)
 
 
-def _room(scene: Callable[[Array], arena.Arena], key: Array, mirrored: bool) -> Room:
+def _room(
+    scene: Callable[[Array], arena.Arena],
+    key: Array,
+    mirrored: bool,
+    jitter: tuple[float, float, float] = START_JITTER,
+) -> Room:
     """Build a scene for one robot and add a random offset to its start pose."""
     texture_key, start_key, policy_key = jax.random.split(key, 3)
     built = scene(texture_key)
     # In float32, so that a key gives the same start at any precision.
     offset = jax.random.uniform(start_key, (3,), jnp.float32, -1.0, 1.0).astype(float)
-    built = replace(built, start=built.start + offset * jnp.asarray(START_JITTER))
+    built = replace(built, start=built.start + offset * jnp.asarray(jitter))
     built = arena.mirror(built) if mirrored else built
     # As many starts as other rooms have, so that one compiled program serves all.
     return Room(arena=built, starts=jnp.tile(built.start, (room_batches.START_COUNT, 1)), key=policy_key)
@@ -136,6 +158,20 @@ def _white_wall(key: Array) -> arena.Arena:
 
 def _corner(key: Array) -> arena.Arena:
     return scenes.with_random_textures(arena.empty_room((4.0, 4.0), start=(0.0, 0.0, 0.25 * jnp.pi)), key)
+
+
+def _gap_trial(name: TrialName, width: float) -> Trial:
+    return Trial(
+        name=name,
+        title=f"a gap of {width:g} m",
+        source="-",
+        paper="not done",
+        shows=f"Two boxes 1.2 m ahead with {width:g} m between them; the robot is 0.4 m wide.",
+        make_rooms=_repeat_scene(lambda key: scenes.gap_scene(width, key), GAP_JITTER),
+        seeds=40,
+        seconds=60.0,
+        beyond=2.0,
+    )
 
 
 TRIALS: dict[str, Trial] = {
@@ -183,7 +219,7 @@ TRIALS: dict[str, Trial] = {
             shows="A box 1.2 m ahead, another to the right, a table with thin legs to the left (its top dashed).",
             make_rooms=_repeat_scene(scenes.indoor_scene),
             seeds=12,
-            seconds=60.0,
+            seconds=90.0,
             beyond=2.2,
         ),
         Trial(
@@ -194,7 +230,7 @@ TRIALS: dict[str, Trial] = {
             shows="Trees with crowns (dashed), bushes and hedges on grass, before a facade.",
             make_rooms=_repeat_scene(scenes.outdoor_scene),
             seeds=10,
-            seconds=60.0,
+            seconds=90.0,
             beyond=2.8,
         ),
         Trial(
@@ -205,9 +241,12 @@ TRIALS: dict[str, Trial] = {
             shows="A box moves into the way from the left, then one from the right (dotted).",
             make_rooms=_repeat_scene(scenes.dynamic_scene),
             seeds=10,
-            seconds=60.0,
+            seconds=90.0,
             beyond=2.2,
         ),
+        _gap_trial("gap", 0.8),
+        _gap_trial("gap-70cm", 0.7),
+        _gap_trial("gap-60cm", 0.6),
         Trial(
             name="white",
             title="a white wall",

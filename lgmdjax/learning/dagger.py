@@ -30,6 +30,7 @@ from lgmdjax.simulation.episodes import Walk
 FIRST_LEARNER_EPISODE = 2**19  # number of the first DAgger round's episode; its rooms are in no other episode
 TURN_GAIN_EPISODE = 2**20  # number of the episode in whose rooms turn gains are compared
 APPROACH_CLEARANCE = 0.08  # m
+MIN_RELATIVE_COVERAGE = 0.9  # of the best coverage of all turn gains, for a gain to be chosen
 HELD_OUT_FRACTION = 0.25  # of the rooms; one half chooses a fit's best epoch, the other scores the fit
 
 
@@ -109,6 +110,9 @@ def select_turn_gain(
 ) -> tuple[navigator.Params, list[JsonObject]]:
     """Choose the turn gain with the fewest approaches per distance; the smallest gain if several have equally few.
 
+    The more a robot turns, the less it approaches anything, and the less floor it sees. Gains with less than
+    `MIN_RELATIVE_COVERAGE` of the best coverage are therefore not chosen.
+
     Args:
         folder: for the walks with each gain, all in the same rooms.
         robot: the robot that walks.
@@ -119,7 +123,7 @@ def select_turn_gain(
 
     Returns:
         The rescaled navigator, and a row per gain, as the stage `train` stores it: `caution` (the gain), `chosen`,
-        `tight` (approaches), `collisions` and `distance`.
+        `tight` (approaches), `collisions`, `distance` and `coverage`.
     """
     if not settings.turn_gains:
         row = {"caution": behaviour_cloning.TURN_GAIN, "chosen": True}
@@ -131,8 +135,11 @@ def select_turn_gain(
         record = _walk_with_gain(folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed)
         score = metrics.score(record, cpg.CYCLE_TIME)
         row = {"caution": turn_gain, "tight": count_approaches(record)}
-        rows.append(row | {"collisions": score.collisions, "distance": score.distance})
-    best = min(range(len(rows)), key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
+        coverage = score.progress.coverage.value
+        rows.append(row | {"collisions": score.collisions, "distance": score.distance, "coverage": coverage})
+    least = MIN_RELATIVE_COVERAGE * max(row["coverage"] for row in rows)
+    going_on = [k for k, row in enumerate(rows) if row["coverage"] >= least]
+    best = min(going_on, key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
     return candidates[best], [row | {"chosen": k == best} for k, row in enumerate(rows)]
 
 

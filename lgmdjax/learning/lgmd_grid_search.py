@@ -3,7 +3,8 @@
 T_s "has to be set experimentally" (paper sec. 3.3). Here the images of recorded walks are rendered again, and the
 detector is run with many pairs of T_s and W_I at once. The best pair is the one whose left-right difference of u,
 averaged over about a gait cycle, correlates best with the left-right difference of proximity, since steering depends on
-which side is nearer.
+which side is nearer. Proximity is that of what is nearest: what is in the way is rare, and with it as the criterion a
+threshold was chosen that kept u at rest in 97 % of the frames.
 
 T_f is then set above every FF value of walking and turning, so that suppression only answers motion that is not the
 robot's own, such as being lifted. A lower T_f suppresses u during turns, and first on the nearer side, so that the

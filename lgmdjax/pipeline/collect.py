@@ -8,6 +8,8 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lgmdjax.body import hexapod
@@ -20,6 +22,12 @@ from lgmdjax.simulation import assembly, closed_loop, episodes, recording, rollo
 from lgmdjax.simulation.assembly import CALIBRATED, load_detector
 
 CALIBRATION_EPISODE = 2**20  # an episode number beyond all others: its rooms are used nowhere else
+CALIBRATION_RULE = braitenberg.Params(corridor=0.0, turn_distance=0.95, full_turn_distance=0.6)
+"""The rule of the calibration walks, which turns from everything near.
+
+T_f has to be above the FF values of hard turns. The teacher's own walks have too few of them: T_f became half as large,
+and silenced the detectors of a robot that had to turn.
+"""
 
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, seed: int) -> None:
@@ -43,7 +51,11 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, see
 def _calibrate(gait: Path, settings: CollectSettings, seed: int) -> JsonObject:
     """Record walks of the teacher without rendering, render them for all candidates, and select the thresholds."""
     detector = lgmd.Params(pooling=settings.eyes.pooling)
-    params = _teacher_robot(gait, settings, detector)
+    params = assembly.with_policy(
+        _teacher_robot(gait, settings, detector),
+        "teacher",
+        jax.tree.map(lambda value: jnp.asarray(value, float), CALIBRATION_RULE),
+    )
     rooms, seconds = (
         room_batches.training_rooms(seed, CALIBRATION_EPISODE, settings.robots),
         settings.calibration_seconds,

@@ -24,8 +24,8 @@ from lgmdjax.errors import InputError
 from lgmdjax.evaluation import collision_causes, run_trial, trials
 from lgmdjax.evaluation.settings import TrialPlan
 from lgmdjax.pipeline.settings import EvaluateSettings
+from lgmdjax.reporting import selection
 from lgmdjax.reporting.figures import style
-from lgmdjax.reporting.walk_video import most_eventful
 from lgmdjax.runtime.storage import write_json
 from lgmdjax.sensors import camera
 from lgmdjax.sensors.settings import CameraSettings
@@ -56,7 +56,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: EvaluateSettings, se
     write_json(folder / "kinds.json", _collision_causes(settings, records, seed))
     continuing = {trial: some for trial, some in records.items() if not trials.TRIALS[trial].ends_at_contact}
     np.savez(folder / "trajectories.npz", allow_pickle=False, **_trajectories(continuing))
-    shown = _one(records["testing"]["learned"], most_eventful(records["testing"]["learned"]))
+    shown = _one(records["testing"]["learned"], selection.select_walk(records["testing"]["learned"]))
     np.savez(folder / "walk.npz", allow_pickle=False, **{name: getattr(shown, name) for name in episodes.FIELDS})
     camera_settings = next(plan.eyes for plan in settings.trials if plan.trial == "testing")
     np.savez(folder / "layers.npz", allow_pickle=False, **_layers(robot.controller.lgmd, camera_settings, shown))

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from lgmdjax.evaluation import trials
 from lgmdjax.locomotion.tripod_gait import Gait
 from lgmdjax.reporting import walk_video
-from lgmdjax.reporting.figures import detection, learning, locomotion, trajectories
+from lgmdjax.reporting.figures import comparison, detection, learning, locomotion, trajectories
 from lgmdjax.runtime.storage import JsonObject, read_arrays
 from lgmdjax.sensors import camera
 from lgmdjax.world import arena
@@ -50,7 +50,8 @@ def plot_detection(run_folder: Path, calibration: JsonObject) -> dict[str, Figur
 def plot_learning(run_folder: Path, training: JsonObject) -> dict[str, Figure]:
     """Plot the learning curves, and predicted commands in a held-out room."""
     prediction = read_arrays(run_folder / "train/prediction.npz")
-    series = (prediction[name] for name in ("time", "u", "distances", "label", "predicted"))
+    distances = "corridor" if "corridor" in prediction else "distances"  # the latter in runs of versions before 0.3
+    series = (prediction[name] for name in ("time", "u", distances, "label", "predicted"))
     return {
         "losses": learning.plot_losses(training["curves"], VARIANTS),
         "prediction": learning.plot_predictions(*series),
@@ -58,7 +59,7 @@ def plot_learning(run_folder: Path, training: JsonObject) -> dict[str, Figure]:
 
 
 def plot_walks(run_folder: Path, scores: Mapping[str, JsonObject], room: arena.Arena) -> dict[str, Figure]:
-    """Plot the paths of all policies in the testing room, and their collision rates.
+    """Plot the paths of all policies in the testing room, their collision rates, and these against coverage.
 
     Args:
         run_folder: with trajectories.npz of stage evaluate.
@@ -76,7 +77,8 @@ def plot_walks(run_folder: Path, scores: Mapping[str, JsonObject], room: arena.A
     rates = {TITLES[trial]: by_policy for trial, by_policy in scores.items()}
     return {
         "trajectories": trajectories.plot_trajectories(room, paths),
-        "policies": trajectories.plot_collision_rates(rates),
+        "policies": comparison.plot_collision_rates(rates),
+        "coverage": comparison.plot_collisions_against_coverage(rates),
     }
 
 

@@ -81,7 +81,7 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
         ),
         "evaluate": EvaluateSettings(
             trials=(
-                TrialPlan(trial="testing", eyes=_QUICK, seeds=16, seconds=20),
+                TrialPlan(trial="testing", eyes=_QUICK, seeds=16, seconds=60),
                 TrialPlan(trial="unseen", eyes=_QUICK, seeds=16, seconds=70),
             )
         ),
@@ -98,7 +98,7 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
             robots=32,
             round_seconds=120,
             split_half_epochs=1000,
-            turn_gains=(1.5, 2.0, 2.5, 3.0),
+            turn_gains=(1.0, 1.5, 2.0, 2.5),
         ),
         "evaluate": EvaluateSettings(
             trials=(
@@ -108,6 +108,9 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
                 TrialPlan(trial="indoor", eyes=_PAPER, coarse=_QUICK, seeds=12),
                 TrialPlan(trial="outdoor", eyes=_PAPER, coarse=_QUICK, seeds=10),
                 TrialPlan(trial="dynamic", eyes=_PAPER, coarse=_QUICK, seeds=10),
+                TrialPlan(trial="gap", eyes=_QUICK, seeds=40),
+                TrialPlan(trial="gap-70cm", eyes=_QUICK, seeds=40),
+                TrialPlan(trial="gap-60cm", eyes=_QUICK, seeds=40),
                 TrialPlan(trial="white", eyes=_QUICK, seeds=12),
                 TrialPlan(trial="corner", eyes=_QUICK, seeds=12),
             )

@@ -85,14 +85,14 @@ def _fit_variants(
 def _prediction(params: navigator.Params, segments: Sequence[Walk]) -> dict[str, np.ndarray]:
     """Predict the commands of the longest segment in a held-out room (fig. 12)."""
     walk = max(segments, key=len)[: round(PLOT_SECONDS * FRAME_RATE)]
-    series = {name: getattr(walk, name) for name in ("time", "u", "distances", "label")}
+    series = {name: getattr(walk, name) for name in ("time", "u", "corridor", "label")}
     return series | {"predicted": behaviour_cloning.predict(params, [walk])[0]}
 
 
 def _baselines(segments: Sequence[Walk]) -> dict[str, np.ndarray | float]:
-    """Return the gain that makes the mean of u - 0.5 equal that of 1/d, and commands of the teacher to replay."""
+    """Return the gain that makes the mean of u - 0.5 equal that of 1/e, and commands of the teacher to replay."""
     u = np.concatenate([walk.u for walk in segments])
-    proximity = np.concatenate([1 / walk.distances for walk in segments])
+    proximity = np.concatenate([1 / walk.corridor for walk in segments])
     commands = np.concatenate([walk.label for walk in segments])
     return {
         "gain": proximity.mean() / max(float((u - lgmd.U_AT_REST).mean()), 1e-6),

@@ -30,7 +30,7 @@ from scipy import ndimage
 from lgmdjax import geometry
 from lgmdjax.body import hexapod
 from lgmdjax.errors import InputError
-from lgmdjax.reporting import third_person, video_io
+from lgmdjax.reporting import selection, third_person, video_io
 from lgmdjax.reporting.figures.style import DARK, LEFT_COLOUR, LIGHT_GREY, RED, RIGHT_COLOUR, STYLE
 from lgmdjax.reporting.third_person import RobotCapsules, Viewpoint
 from lgmdjax.sensors import camera
@@ -98,14 +98,14 @@ def write_video(
 ) -> Path:
     """Write an MP4 video of one walk of a record and return its path.
 
-    The video shows the segment of the walk with the most turning.
+    The video shows the part of the walk that `selection.select_segment` selects.
 
     Args:
         path: of the video file.
         record: recorded walks, axes (robot, frame), or one walk, axis (frame,).
         room: the rooms of the walks (`lgmdjax.rollout`), or a single room for all of them.
         robot: the robot that walked, whose camera renders the eyes' images; the pretrained robot by default.
-        index: number of the robot to show; by default the one with the most eventful walk (`most_eventful`).
+        index: number of the robot to show; by default that of `selection.select_walk`.
         seconds: duration of the video, at twice real speed; it is shorter if the walk is.
 
     ```python
@@ -118,7 +118,7 @@ def write_video(
     ```
     """
     batch = jax.tree.map(np.asarray, record if np.ndim(record.time) == 2 else jax.tree.map(lambda x: x[None], record))
-    index = most_eventful(batch) if index is None else index
+    index = selection.select_walk(batch) if index is None else index
     if not -len(batch.time) <= index < len(batch.time):
         raise InputError(f"expected an index of one of {len(batch.time)} walks, got {index}; choose another")
     scene = room.arena if isinstance(room, Room) else room
@@ -129,19 +129,10 @@ def write_video(
     return Path(path)
 
 
-def most_eventful(record: Record) -> int:
-    """Return the number of the robot with the most turning among those with the fewest collisions; axes (robot, frame).
-
-    Robots that were lost come last.
-    """
-    turning = np.abs(record.velocity[..., 1] - record.velocity[..., 0]).mean(axis=1)
-    return int(np.argmax(turning - 1e3 * record.contact.sum(axis=1) - 1e6 * ~record.ok[:, -1]))
-
-
 def write_trace(
     target: Path | BinaryIO, trace: WalkTrace, room: arena.Arena, eyes: camera.Params, seconds: float = 10.0
 ) -> int:
-    """Write an MP4 video of the segment of a walk with the most turning; return the number of images.
+    """Write an MP4 video of a segment of a walk (`selection.select_segment`); return the number of images.
 
     Args:
         target: path of the file, or a binary stream.
@@ -151,30 +142,13 @@ def write_trace(
         seconds: duration of the video; it is shorter if the walk is.
     """
     _check(trace)
-    frames = select_segment(trace, round(seconds * VIDEO_RATE) * FRAME_STRIDE)
+    frames = selection.select_segment(trace.position, trace.velocity, round(seconds * VIDEO_RATE) * FRAME_STRIDE)
     views, robot = _views(trace, frames[::FRAME_STRIDE])
     page = _Page(trace, frames, (eyes.width, eyes.height))
     with video_io.open_writer(target, *VIDEO_SIZE, VIDEO_RATE) as write:
         for index, (view, eye_images) in enumerate(_render(views, robot, room, eyes)):
             write(page.compose(view, eye_images, frames[index * FRAME_STRIDE], eyes.overlap))
     return len(views.time)
-
-
-def select_segment(trace: WalkTrace, frames: int) -> Int[ndarray, " frames"]:
-    """Return the consecutive frames with the most turning, if possible without a reset."""
-    total = len(trace.time)
-    frames = min(max(frames, 1), total)
-    turning = np.abs(trace.velocity[:, 1] - trace.velocity[:, 0])
-    resets = np.concatenate([[0.0], detect_resets(trace.position).astype(float)])
-    sums = np.concatenate([[0.0], np.cumsum(turning - 1e6 * resets)])
-    starts = np.arange(0, total - frames + 1, 15)  # every half second
-    first = starts[np.argmax(sums[starts + frames] - sums[starts])]
-    return np.arange(first, first + frames)
-
-
-def detect_resets(position: Float[ndarray, "frames 3"]) -> Bool[ndarray, " steps"]:
-    """Find the steps between frames in which the robot was reset: it can't walk 5 cm in 1/30 s."""
-    return np.linalg.norm(np.diff(position, axis=0), axis=1) > 0.05
 
 
 def _check(trace: WalkTrace) -> None:
@@ -213,7 +187,7 @@ def _views(trace: WalkTrace, rows: Int[ndarray, " n"]) -> tuple[_Views, RobotCap
 def _smooth(trace: WalkTrace) -> tuple[Float[ndarray, "frames 3"], Float[ndarray, " frames"]]:
     """Smooth positions over a second and headings over two, but not across a reset, for a steady camera."""
     heading = np.unwrap(geometry.yaw(trace.quaternion))
-    position, starts = trace.position.copy(), np.flatnonzero(detect_resets(trace.position)) + 1
+    position, starts = trace.position.copy(), np.flatnonzero(selection.detect_resets(trace.position)) + 1
     for segment in np.split(np.arange(len(heading)), starts):
         position[segment] = ndimage.uniform_filter1d(trace.position[segment], 31, axis=0, mode="nearest")
         heading[segment] = ndimage.gaussian_filter1d(heading[segment], 20, mode="nearest")

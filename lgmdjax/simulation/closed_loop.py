@@ -94,7 +94,8 @@ class Record:
     u: Float[AnyArray, "*axes 2"]
     feed_forward: Float[AnyArray, "*axes 2"]  # grey
     excitation: Float[AnyArray, "*axes 2"]  # grey, U / n_cell
-    distances: Float[AnyArray, "*axes 2"]  # m
+    distances: Float[AnyArray, "*axes 2"]  # m, to the nearest obstacle
+    corridor: Float[AnyArray, "*axes 2"]  # m, to the nearest obstacle in the way
     label: Float[AnyArray, "*axes 2"]  # velocity of the teacher, nominal
     velocity: Float[AnyArray, "*axes 2"]  # velocity of the policy, nominal
     clearance: Float[AnyArray, "*axes"]  # m, smallest within the frame
@@ -220,7 +221,7 @@ def observe(
 ) -> tuple[State, Observation]:
     """Render, scan, and step the LGMDs (eqs. 7-16); return the observation from the robot's present pose."""
     pose = hexapod.pose(state.data)
-    distances = laser.hemifield_distances(laser.scan(params.laser, scene, *hexapod.laser_pose(pose)))
+    ranges = laser.scan(params.laser, scene, *hexapod.laser_pose(pose))
 
     head = pose if params.head_sway is None else hexapod.scale_tilt(pose, params.head_sway)
     frames = render_stereo(params.camera, scene, head, render)
@@ -232,7 +233,11 @@ def observe(
         new, old = (controller_state, response), (state.controller, state.response)
         controller_state, response = _where(has_picture, new, old)
     observation = Observation(
-        u=response.u, feed_forward=response.feed_forward, excitation=response.excitation, distances=distances
+        u=response.u,
+        feed_forward=response.feed_forward,
+        excitation=response.excitation,
+        distances=laser.hemifield_distances(ranges),
+        corridor=laser.corridor_distances(params.laser, ranges),
     )
     return replace(state, controller=controller_state, response=response), observation
 
@@ -255,7 +260,8 @@ def render_stereo(
 
 def decide(params: Params, state: State, observation: Observation, policy: Policy) -> tuple[State, Float[Array, "2"]]:
     """Let the policy choose the velocity; return also the teacher's velocity (eq. 22, limited), the label."""
-    _, label = braitenberg.step(params.teacher, state.teacher, observation.distances)
+    distances = braitenberg.sensed_distances(params.teacher, observation.distances, observation.corridor)
+    _, label = braitenberg.step(params.teacher, state.teacher, distances)
     controller_state = controller.decide(params.controller, state.controller, observation, policy)
     teacher = braitenberg.track_turn(params.teacher, controller_state.velocity)
     return replace(state, controller=controller_state, teacher=teacher), label
@@ -300,6 +306,7 @@ def _record(state: State, observation: Observation, label: Float[Array, "2"], cl
         feed_forward=observation.feed_forward,
         excitation=observation.excitation,
         distances=observation.distances,
+        corridor=observation.corridor,
         label=label,
         velocity=state.controller.velocity,
         clearance=clearance,

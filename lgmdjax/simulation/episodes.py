@@ -11,6 +11,7 @@ A walk is the recorded trajectory of one robot in one room.
 | u_*, feed_forward_*           | 1, grey  | outputs of the LGMD of the left and the right eye           |
 | excitation_*                  | grey     | mean excitation of the LGMD, before feed-forward inhibition |
 | distance_*                    | m        | nearest obstacle in the left and the right hemifield        |
+| corridor_*                    | m        | nearest obstacle in the way, on either side                 |
 | label_*, velocity_*           | nominal  | velocity of the teacher, and velocity of the policy         |
 | clearance, contact            | m, -     | smallest clearance within the frame, and whether it was <= 0 |
 | is_first, resets, ok          | -        | first frame after a start or reset, resets so far, healthy  |
@@ -19,7 +20,8 @@ Pictures are not stored: `lgmdjax.simulation.rerender` renders them again from t
 Each chunk is a file that gets its name when it is complete, so that an interruption loses only the present chunk.
 Numbers keep their precision.
 
-Version 1 called the columns `is_first` and `resets` "fresh" and "setbacks"; it can still be read.
+Version 1 called the columns `is_first` and `resets` "fresh" and "setbacks"; versions 1 and 2 lack `corridor_*`, for
+which `distance_*` is read. Both can still be read.
 
 Source: Cizek & Faigl, sec. 4.2 and 5.1: the training data are segments of collision-free walking.
 """
@@ -41,9 +43,11 @@ from lgmdjax.runtime import storage, versions
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation.closed_loop import Record
 
-FORMAT, VERSION = "lgmdjax episodes", 2
-RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, VERSION: {}}
+FORMAT, VERSION = "lgmdjax episodes", 3
+RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, 2: {}, VERSION: {}}
 """Versions that can be read, and their other names of columns."""
+NEAREST_ONLY = (1, 2)
+"""Versions without distances along the corridor: their teacher reacted to the nearest distances."""
 
 SIDES = ("left", "right")
 
@@ -65,6 +69,7 @@ FIELDS: Mapping[str, Field] = {
     "feed_forward": Field(tuple(f"feed_forward_{side}" for side in SIDES), "grey"),
     "excitation": Field(tuple(f"excitation_{side}" for side in SIDES), "grey"),
     "distances": Field(tuple(f"distance_{side}" for side in SIDES), "m"),
+    "corridor": Field(tuple(f"corridor_{side}" for side in SIDES), "m"),
     "label": Field(tuple(f"label_{side}" for side in SIDES), "0.05 m/s"),
     "velocity": Field(tuple(f"velocity_{side}" for side in SIDES), "0.05 m/s"),
     "clearance": Field(("clearance",), "m"),
@@ -259,7 +264,7 @@ def _tables(folder: Path, parameters: JsonObject | None) -> list[pa.Table]:
             raise InputError(
                 f"{path}: expected walks of the same settings, got {_differences(expected, found)}; use another folder"
             )
-        tables.append(_read(path, RENAMED[header["version"]]))
+        tables.append(_read(path, header["version"]))
     return tables
 
 
@@ -280,13 +285,16 @@ def _header(path: Path) -> JsonObject:
     return header
 
 
-def _read(path: Path, renamed: Mapping[str, str]) -> pa.Table:
-    """Return the columns of a chunk under their present names."""
+def _read(path: Path, version: int) -> pa.Table:
+    """Return the columns of a chunk of some version, under their present names."""
     try:
         table = pq.read_table(path, page_checksum_verification=True)
     except (OSError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
-    table = table.rename_columns([renamed.get(name, name) for name in table.column_names])
+    table = table.rename_columns([RENAMED[version].get(name, name) for name in table.column_names])
+    if version in NEAREST_ONLY and "corridor_left" not in table.column_names:
+        for side in SIDES:
+            table = table.append_column(f"corridor_{side}", table[f"distance_{side}"])
     if missing := set(COLUMNS) - set(table.column_names):
         raise InputError(f"{path}: expected all columns, got none called {min(missing)}; collect it again")
     return table.select(COLUMNS)

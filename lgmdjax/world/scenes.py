@@ -27,6 +27,8 @@ MIN_GAP = 0.8
 """Minimum gap between obstacles and around the start [m]: twice the width of the robot."""
 INDOOR_FLOOR_CONTRAST, RANDOM_FLOOR_CONTRAST = 0.12, 0.5
 """Upper bound of the contrast of floors, in the paper's rooms and in random rooms."""
+GAP_BOX = 0.25
+"""Half the side of the boxes of `gap_scene` [m]."""
 PLACEMENT_ATTEMPTS = 128
 """Number of positions that are tried for each obstacle of a random room."""
 
@@ -128,6 +130,14 @@ def dynamic_scene(key: Array | None = None, *, departs: ArrayLike = (10.0, 24.0)
     motion = {"goal": [[1.5, 0.1], [1.3, -1.2]], "departs": departs, "arrives": departs + 2.0}
     boxes = make_prisms([[1.5, 2.3], [1.3, -2.3]], 0.20, 0.8, **motion)
     return scale_contrast(with_random_textures(empty_room((7.0, 6.0), boxes=boxes), key), contrast)
+
+
+def gap_scene(width: ArrayLike, key: Array | None = None, *, contrast: ArrayLike = 1.0) -> Arena:
+    """Build two boxes 1.2 m ahead, side by side with `width` [m] between them; straight ahead leads through the gap."""
+    lateral = 0.5 * jnp.asarray(width, dtype=float) + GAP_BOX
+    centres = jnp.stack([jnp.stack([1.2 + GAP_BOX, lateral]), jnp.stack([1.2 + GAP_BOX, -lateral])])
+    room = empty_room((7.0, 6.0), boxes=make_prisms(centres, GAP_BOX, 0.8))
+    return scale_contrast(with_random_textures(room, key), contrast)
 
 
 def random_room(

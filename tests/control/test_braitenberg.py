@@ -14,6 +14,7 @@ from lgmdjax.control import braitenberg
 from lgmdjax.errors import InputError
 
 PARAMS = braitenberg.Params()
+PAPER = replace(PARAMS, base=1.2)
 distances = st.tuples(st.floats(0.02, 5.0), st.floats(0.02, 5.0))
 step = jax.jit(braitenberg.step)
 rule = jax.jit(braitenberg.rule)
@@ -36,7 +37,7 @@ def test_vehicles_equal_the_paper(strict, name):
 @given(distances)
 def test_rule_equals_eq_22_and_never_retreats(d):
     """The sum is 2 v_base + (k_2a - k_3b)(1/d_l + 1/d_r) > 0: one side always goes forward."""
-    velocity = rule(PARAMS, jnp.asarray(d))
+    velocity = rule(PAPER, jnp.asarray(d))
     np.testing.assert_allclose(velocity, reference.rule(*d), rtol=1e-6, atol=1e-6)
     assert max(velocity) > 0
 
@@ -71,6 +72,35 @@ def test_limit_keeps_the_turn_rather_than_the_speed(velocity):
         np.testing.assert_allclose(limited, velocity, atol=1e-9)
     elif abs(turn) < 3:  # shifted no further than to the edge of the range
         assert np.isclose(limited.max(), 2) or np.isclose(limited.min(), -1)
+
+
+def test_what_is_in_the_way_counts_more_than_what_is_near():
+    """The nearness that the rule gets is a weighted mean; weight 0 is the paper's, d alone."""
+    nearest, corridor = jnp.asarray([0.4, 1.5]), jnp.asarray([5.0, 1.5])
+    found = braitenberg.sensed_distances(replace(PARAMS, corridor=0.8), nearest, corridor)
+    np.testing.assert_allclose(found, [1 / (0.8 / 5 + 0.2 / 0.4), 1.5])
+    for weight, expected in ((0.0, nearest), (1.0, corridor)):
+        found = braitenberg.sensed_distances(replace(PARAMS, corridor=weight), nearest, corridor)
+        np.testing.assert_allclose(found, expected)
+
+
+def test_before_a_wall_it_turns_away_from_the_nearer_side():
+    """The way is equally closed on both sides, and a second wall is beside it: the first turn is away from that."""
+    corridor = jnp.asarray([0.7, 0.7])
+    for nearest, side in (((0.35, 0.7), -1), ((0.7, 0.35), 1)):
+        sensed = braitenberg.sensed_distances(PARAMS, jnp.asarray(nearest), corridor)
+        after, (left, right) = teach(sensed)
+        assert after == side and (right - left) * side > 0.3
+
+
+def test_beside_a_wall_it_goes_on():
+    """A wall at 0.35 m, along which the way is free, hardly turns it; the paper's rule turns away hard."""
+    nearest, corridor = jnp.asarray([0.35, 5.0]), jnp.asarray([5.0, 5.0])
+    turns = []
+    for weight in (PARAMS.corridor, 0.0):
+        velocity = teach(braitenberg.sensed_distances(replace(PARAMS, corridor=weight), nearest, corridor))[1]
+        turns.append(velocity[0] - velocity[1])
+    assert 0 < turns[0] < 0.8 and turns[1] == pytest.approx(3)
 
 
 def test_without_minimum_turn_and_tie_break_the_teacher_is_the_limited_rule():
@@ -125,7 +155,7 @@ def test_a_clearly_nearer_side_reverses_the_turn():
 def test_far_from_obstacles_no_side_is_chosen():
     """Otherwise a robot and its mirror image would turn to the same side before they meet an obstacle."""
     assert teach((5.0, 5.0))[0] == 0
-    np.testing.assert_allclose(teach((5.0, 5.0))[1], 1.2 + 0.2 / 5, rtol=1e-6)
+    np.testing.assert_allclose(teach((5.0, 5.0))[1], 1.3 + 0.2 / 5, rtol=1e-6)
 
 
 def test_gradients_are_finite_even_at_distance_zero(precision, strict):

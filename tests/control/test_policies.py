@@ -28,7 +28,7 @@ def test_policies_that_use_the_camera_say_so():
     def velocity(policy: policies.Policy, own, u: float) -> np.ndarray:
         both = jnp.full(2, u)
         observation = policies.Observation(
-            u=both, feed_forward=both, excitation=both, distances=jnp.asarray([1.0, 2.0])
+            u=both, feed_forward=both, excitation=both, distances=jnp.ones(2), corridor=jnp.asarray([1.0, 2.0])
         )
         return np.asarray(policy.step(own, policy.init(own, jax.random.key(0)), observation)[1])
 
@@ -39,8 +39,9 @@ def test_policies_that_use_the_camera_say_so():
 
 def test_the_switch_returns_the_velocity_of_the_active_policy():
     params = assembly.make_policies(direct_gain=1.0, replay_velocities=np.full((4096, 2), 0.7))
+    zeros, ahead = jnp.zeros(2), jnp.asarray([1.0, 0.7])
     observation = policies.Observation(
-        u=jnp.asarray([0.6, 0.8]), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2), distances=jnp.asarray([1.0, 0.7])
+        u=jnp.asarray([0.6, 0.8]), feed_forward=zeros, excitation=zeros, distances=zeros, corridor=ahead
     )
     key = jax.random.key(0)
     for index, policy in enumerate(policies.POLICIES):

@@ -71,8 +71,8 @@ def test_outcomes_are_described_in_one_line_per_trial_and_policy(out):
     """Recorded walks are not simulated again."""
     (line,) = cli_trial.run_trials(flags.TrialFlags(trials=("indoor",), policy=("learned",), seeds=SEEDS, out=out))
     assert f"indoor, learned: {SEEDS} of {SEEDS} untouched" in line
-    score = {"collisions": 3, "distance": 41.2, "per_100_m": {}}
-    assert cli_trial.describe(score) == "3 collisions in 41 m"
+    score = {"collisions": 3, "distance": 41.2, "per_100_m": {}, "progress": {"coverage": {"value": 18.2}}}
+    assert cli_trial.describe(score) == "3 collisions in 41 m, 18.2 new cells a minute"
 
 
 @pytest.mark.parametrize(("trial", "policy"), [("indoors", "learned"), ("indoor", "expert")])
@@ -108,7 +108,7 @@ def test_any_number_of_robots_is_rolled_out_in_batches_of_one_size(monkeypatch):
         yield replace(record, position=np.repeat(starts, 3, axis=1))
 
     monkeypatch.setattr(recording, "rollout_with_progress", stand)
-    monkeypatch.setattr(recording, "BATCH_SIZE", 4)
+    monkeypatch.setattr(recording, "BATCH_SIZES", (2, 4))
     rooms = room_batches.random_rooms(jax.random.key(0), 9)
     robot = closed_loop.assemble(assembly.make_policies())
     batches = list(recording.rollout_in_batches(robot, hexapod.build(), rooms, 0.1, "standing", skip_batches=1))

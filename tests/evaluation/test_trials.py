@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from synthetic import walk
 
-from lgmdjax.evaluation import trials
+from lgmdjax.evaluation import run_trial, trials
 from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.world import arena, scenes
 
 KEY = jax.random.key(8)
-SCENES = ("tube", "indoor", "outdoor", "dynamic", "white", "corner")
+SCENES = ("tube", "indoor", "outdoor", "dynamic", "gap", "gap-60cm", "white", "corner")
 TUBE = trials.TRIALS["tube"]
 
 
@@ -32,7 +32,8 @@ def test_rooms_are_valid_and_starts_are_near_those_of_the_paper(rooms, name):
     arena.validate(batch.arena)
     np.testing.assert_array_equal(batch.starts[:, 0], batch.arena.start)
     expected = np.array([0, 0, np.pi / 4 if name == "corner" else 0])
-    assert np.all(np.abs(np.abs(batch.arena.start) - expected) <= np.array(trials.START_JITTER) + 1e-12)
+    jitter = trials.GAP_JITTER if name.startswith("gap") else trials.START_JITTER
+    assert np.all(np.abs(np.abs(batch.arena.start) - expected) <= np.array(jitter) + 1e-12)
     assert len(np.unique(batch.arena.start[:, 0])) > 1
 
 
@@ -91,3 +92,30 @@ def test_a_robot_that_turns_back_has_retreated_and_a_lost_robot_has_failed():
 def test_a_trial_without_contact_or_passing_ends_with_the_record():
     outcome = trials.find_outcome(TUBE, walk(1, frames=300))
     assert (outcome.frames.tolist(), outcome.touched.tolist(), outcome.retreated.tolist()) == ([300], [False], [False])
+
+
+def test_turning_on_the_spot_is_no_success():
+    """It touches nothing, and counts neither as having passed nor as progress."""
+    yaw = np.tile(0.2 * np.arange(1200) / 30, (2, 1))
+    quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
+    record = walk(position=np.zeros((2, 1200, 3)), quaternion=quaternion)
+    for trial in trials.TRIALS.values():
+        if trial.ends_at_contact:
+            outcome = trials.find_outcome(trial, record)
+            assert not outcome.touched.any() and not outcome.passed.any() and outcome.retreated.all()
+            assert outcome.passing().value == 0 and np.all(outcome.made_good == 0)
+    summary = run_trial.summarise(TUBE, record)
+    assert (summary["untouched"], summary["passed"], summary["made_good"]["value"]) == (2, 0, 0)
+    assert summary["progress"]["hard_turning"]["value"] > 0.98  # but for the ends of the average
+    assert summary["progress"]["longest_rotation"] > 1
+
+
+def test_frames_after_the_end_of_a_trial_are_no_progress():
+    """The robots pass the tube after 33 s and then turn on the spot."""
+    yaw = np.zeros((2, 1200))
+    yaw[:, 1000:] = 0.2 * np.arange(200) / 30
+    quaternion = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=-1)
+    summary = run_trial.summarise(TUBE, walk(quaternion=quaternion))
+    assert summary["passed"] == 2 and summary["passing"]["value"] == 1
+    assert summary["made_good"]["value"] == pytest.approx(0.05, rel=0.01)
+    assert summary["progress"]["hard_turning"]["value"] == 0

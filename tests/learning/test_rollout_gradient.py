@@ -102,6 +102,7 @@ def test_three_routes_agree_over_one_frame(params, check):
     check.assert_every_leaf_agrees(params.controller, weights)
 
 
+@pytest.mark.default_xla
 def test_the_gradient_through_the_controller_is_that_of_imitation_on_the_recorded_walk(params, rolled_out):
     """The navigator alone, on the recorded u, with constant labels."""
     start, _, record, gradient = rolled_out
@@ -112,6 +113,7 @@ def test_the_gradient_through_the_controller_is_that_of_imitation_on_the_recorde
             feed_forward=record.feed_forward,
             excitation=record.excitation,
             distances=record.distances,
+            corridor=record.corridor,
         )
         _, velocity = jax.lax.scan(partial(policies.LEARNED.step, policy_params), start.controller.policy, observations)
         return jnp.mean((velocity - record.label) ** 2)

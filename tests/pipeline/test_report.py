@@ -101,13 +101,13 @@ def test_the_page_is_self_contained(source: str):
 
 def test_all_figures_are_embedded_and_self_contained(source: str):
     pictures = inlined(source, "image/svg+xml")
-    assert len(pictures) == 9
+    assert len(pictures) == 10
     for picture in pictures:
         root = ElementTree.fromstring(picture)
         links = [value for node in root.iter() for name, value in node.attrib.items() if name.endswith("href")]
         assert all(link.startswith(("#", "data:")) for link in links)
     described = [value for tag, name, value in Page(source).attributes if tag == "img" and name == "alt"]
-    assert len(described) == 9 and all(described)
+    assert len(described) == 10 and all(described)
 
 
 def test_the_video_plays(source: str):

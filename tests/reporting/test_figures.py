@@ -13,7 +13,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Circle, Polygon
 
 from lgmdjax.control.names import POLICY_NAMES
-from lgmdjax.reporting.figures import detection, learning, locomotion, style, trajectories
+from lgmdjax.reporting.figures import comparison, detection, learning, locomotion, style, trajectories
 from lgmdjax.simulation.closed_loop import Room
 
 
@@ -57,7 +57,8 @@ def figures(run: Path) -> dict[str, Figure]:
         "trajectories": trajectories.plot_trajectories(
             synthetic.room(), {name: paths_of(paths, name) for name in POLICY_NAMES}
         ),
-        "collision_rates": trajectories.plot_collision_rates(evaluation),
+        "collision_rates": comparison.plot_collision_rates(evaluation),
+        "coverage": comparison.plot_collisions_against_coverage(evaluation),
         "passages": passages(paths["testing_learned"]),
     }
 
@@ -84,6 +85,7 @@ NAMES = (
     "predictions",
     "trajectories",
     "collision_rates",
+    "coverage",
     "passages",
 )
 

@@ -170,20 +170,6 @@ def test_surfaces_are_shaded_by_their_orientation(render_ball: Callable[..., np.
     assert picture[rows[1], 80].mean() > 1.2 * picture[rows[-3], 80].mean()
 
 
-def test_the_segment_with_most_turning_is_selected_and_resets_are_avoided(walk: walk_video.WalkTrace):
-    frames = len(walk.time)
-    velocity = np.full((frames, 2), 1.2)
-    velocity[60:90] = (2.0, -1.0)
-    velocity[180:240] = (2.0, -1.0)
-    position = np.cumsum(np.full((frames, 3), [0.002, 0, 0]), axis=0)
-    assert walk_video.select_segment(walk._replace(velocity=velocity, position=position), 60)[0] in range(165, 196)
-    position[210:] += 3.0
-    selected = walk_video.select_segment(walk._replace(velocity=velocity, position=position), 60)
-    assert np.all(np.diff(selected) == 1)
-    assert 60 in selected and 89 in selected
-    assert walk_video.select_segment(walk, 10_000).tolist() == list(range(frames))
-
-
 def test_a_trace_with_wrong_shapes_or_numbers_is_refused(walk: walk_video.WalkTrace, tmp_path: Path):
     for bad in (
         walk._replace(joints=walk.joints[:, :5]),
@@ -193,14 +179,6 @@ def test_a_trace_with_wrong_shapes_or_numbers_is_refused(walk: walk_video.WalkTr
         with pytest.raises(InputError, match="expected a walk"):
             walk_video.write_trace(tmp_path / "walk.mp4", bad, synthetic.room(), EYES)
     assert not (tmp_path / "walk.mp4").exists()
-
-
-def test_the_most_eventful_walk_has_most_turning_among_those_with_fewest_collisions():
-    velocity = np.zeros((4, 300, 2))
-    velocity[..., 1] = np.array([3.0, 1.0, 2.0, 4.0])[:, None]
-    contact, ok = np.zeros((4, 300), bool), np.ones((4, 300), bool)
-    contact[0, 10], ok[3, 200:] = True, False
-    assert walk_video.most_eventful(synthetic.walk(4, 300, velocity=velocity, contact=contact, ok=ok)) == 2
 
 
 def test_a_video_of_a_record_shows_one_walk_in_its_own_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

@@ -112,3 +112,23 @@ def test_impossible_parameters_are_refused(wrong):
     laser.check(laser.Params())
     with pytest.raises(InputError, match=next(iter(wrong))):
         laser.check(laser.Params(**wrong))
+
+
+def test_corridor_distances_equal_those_of_single_hits() -> None:
+    """Of a box ahead to the left and a wall beside on the right."""
+    room = arena.empty_room((8.0, 2.0), boxes=arena.make_prisms([[1.5, 0.3]], 0.2, 0.8))
+    ranges = np.asarray(scan(room, jnp.asarray([0.0, 0.0, 0.2]), np.eye(3)))
+    phi = np.deg2rad(np.linspace(-85.0, 85.0, 341))
+    w, a = PARAMS.corridor_half_width, PARAMS.corridor_slope
+    e = [min(r * np.cos(p) + a * max(abs(r * np.sin(p)) - w, 0), 5.0) for r, p in zip(ranges, phi, strict=True)]
+    found = laser.corridor_distances(PARAMS, jnp.asarray(ranges))
+    np.testing.assert_allclose(found, [min(e[170:]), min(e[:171])], atol=1e-9)
+    nearest = laser.hemifield_distances(jnp.asarray(ranges))
+    assert found[0] == pytest.approx(1.3, abs=0.01)  # the box's near face, which reaches 0.1 m beyond the middle
+    assert nearest[1] < 1.01 < 1.3 < found[1]  # the wall is near, and not in the way
+
+
+def test_an_impossible_corridor_is_refused() -> None:
+    for params in (laser.Params(corridor_half_width=-0.1), laser.Params(corridor_slope=math.nan)):
+        with pytest.raises(InputError, match=r"laser corridor_.*: expected a finite number >= 0"):
+            laser.check(params)

@@ -22,6 +22,7 @@ SHAPES = {
     "feed_forward": (2,),
     "excitation": (2,),
     "distances": (2,),
+    "corridor": (2,),
     "label": (2,),
     "velocity": (2,),
     "clearance": (),
@@ -97,7 +98,7 @@ def test_a_file_describes_itself(tmp_path):
     assert header["units"]["distance_left"] == "m" and header["units"]["joint_17"] == "rad"
     assert header["parameters"] == SETTINGS == episodes.read_parameters(tmp_path)
     assert set(header["versions"]) >= {"jax", "mujoco"}
-    assert header["version"] == 2
+    assert header["version"] == episodes.VERSION
 
 
 def test_version_1_is_read_and_continued(tmp_path):
@@ -107,6 +108,7 @@ def test_version_1_is_read_and_continued(tmp_path):
     writer = episodes.Writer(tmp_path, episodes.read_parameters(tmp_path))
     before = episodes.read(tmp_path)
     np.testing.assert_array_equal(before[0].is_first, pq.read_table(old)["fresh"].to_numpy()[: len(before[0])])
+    np.testing.assert_array_equal(before[0].corridor, before[0].distances)  # of their teacher
     dtype = before[0].position.dtype
     added = record(robots=2, start=60, dtype=dtype.type)
     writer.write(added, episode=before[0].episode, rooms=[walk.room for walk in before], seed=before[0].seed)
@@ -186,7 +188,7 @@ def test_files_of_another_kind_or_version_are_refused(tmp_path):
     table = pq.read_table(path)
     header = json.loads(table.schema.metadata[b"lgmdjax"])
     pq.write_table(table.replace_schema_metadata({"lgmdjax": json.dumps(header | {"version": 0})}), path)
-    refused(tmp_path, "expected walks of version 1 or 2, got 0")
+    refused(tmp_path, "expected walks of version 1 or 2 or 3, got 0")
     pq.write_table(table.drop_columns("u_left"), path)
     refused(tmp_path, "got none called u_left")
     pq.write_table(pa.table({"u": [1.0]}), path)

@@ -1,3 +1,4 @@
+from . import comparison as comparison
 from . import detection as detection
 from . import learning as learning
 from . import locomotion as locomotion

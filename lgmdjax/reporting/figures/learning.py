@@ -45,18 +45,18 @@ def plot_losses(curves: Mapping[str, Mapping[str, Sequence[float]]], names: Mapp
 def plot_predictions(
     time: Float[ndarray, " frames"],
     u: Float[ndarray, "frames 2"],
-    distances: Float[ndarray, "frames 2"],
+    corridor: Float[ndarray, "frames 2"],
     label: Float[ndarray, "frames 2"],
     predicted: Float[ndarray, "frames 2"],
 ) -> Figure:
-    """Plot a segment of recorded walking (fig. 12): u, distances, the rule's command and the learned policy's command.
+    """Plot a segment of recorded walking (fig. 12): u, free way, the rule's command and the learned policy's command.
 
     u oscillates with every step and is plotted with its mean over a second.
 
     Args:
         time: s.
         u: LGMD outputs.
-        distances: to the nearest obstacle on either side [m].
+        corridor: how far the way ahead is free on either side, to which the rule reacts [m].
         label: the rule's command, in multiples of 0.05 m/s.
         predicted: the learned policy's command, in multiples of 0.05 m/s.
     """
@@ -64,11 +64,11 @@ def plot_predictions(
     panels = figure.subplots(4, 1, sharex=True)
     titles = (
         ("LGMD outputs: input of the learned policy", "u [1]"),
-        ("nearest obstacle by laser: input of the rule", "d [m]"),
+        ("free way on either side by laser: input of the rule", "e [m]"),
         ("command of the rule (the label)", "v [0.05 m/s]"),
         ("command of the learned policy", "v [0.05 m/s]"),
     )
-    for axes, series, (title, unit) in zip(panels, (u, distances, label, predicted), titles, strict=True):
+    for axes, series, (title, unit) in zip(panels, (u, corridor, label, predicted), titles, strict=True):
         for values, colour, side in zip(series.T, (LEFT_COLOUR, RIGHT_COLOUR), ("left", "right"), strict=True):
             oscillates = series is u
             axes.plot(time, values, color=colour, linewidth=1.0, alpha=0.35 if oscillates else 1.0, label=side)

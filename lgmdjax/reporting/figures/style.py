@@ -16,7 +16,8 @@ palette of Okabe & Ito, which colour-blind readers can tell apart.
 | `trajectories.plot_trajectories`      | 13           | walks of all policies in one room                        |
 | `trajectories.plot_walks`             | -            | walks of a record in their rooms                         |
 | `trajectories.plot_passages`          | 14, 16       | paths past an obstacle                                   |
-| `trajectories.plot_collision_rates`   | -            | collisions per 100 m of every policy, with intervals     |
+| `comparison.plot_collision_rates`     | -            | collisions per 100 m of every policy, with intervals     |
+| `comparison.plot_collisions_against_coverage` | -    | the same against the floor that every policy sees        |
 """
 
 import io

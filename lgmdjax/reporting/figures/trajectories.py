@@ -1,4 +1,4 @@
-"""Plots of walks seen from above, and of collision rates."""
+"""Plots of walks seen from above."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -22,7 +22,6 @@ from lgmdjax.reporting.figures.style import (
     WIDTH,
     styled,
 )
-from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation.closed_loop import Record, Room
 from lgmdjax.world.arena import Arena, Prisms, is_inactive, is_overhead
 
@@ -219,33 +218,3 @@ def add_paths(axes: Axes, paths: Paths, colours: Sequence[str]) -> None:
         axes.plot(*positions[0, :2], **start, zorder=4)
     axes.plot([], [], **start, label="start")
     axes.plot([], [], **collision, label="collision, robot reset")
-
-
-@styled
-def plot_collision_rates(scores: Mapping[str, Mapping[str, JsonObject]]) -> Figure:
-    """Plot collisions per 100 m of every policy in every trial, with 95 % intervals.
-
-    Args:
-        scores: title of the trial -> name of the policy -> score, whose "per_100_m" has value, low, high.
-    """
-    figure = Figure(figsize=(WIDTH, 0.85 + 0.27 * max(len(policies) for policies in scores.values())))
-    panels = np.atleast_1d(figure.subplots(1, len(scores)))
-    for axes, (trial, policies) in zip(panels, scores.items(), strict=True):
-        for row, (name, score) in enumerate(policies.items()):
-            rate, colour = score["per_100_m"], POLICY_COLOURS.get(name, GREY)
-            axes.plot([rate["low"], rate["high"]], [row, row], color=colour, linewidth=2.2)
-            axes.plot([rate["value"]], [row], "o", color=colour, markersize=6, clip_on=False, zorder=3)
-            axes.annotate(
-                f"{rate['value']:.3g}",
-                (rate["high"], row),
-                xytext=(5, 0),
-                va="center",
-                fontsize=8,
-                textcoords="offset points",
-            )
-        axes.set_yticks(range(len(policies)), list(policies))
-        axes.set(title=trial, xlabel="collisions per 100 m", ylim=(len(policies) - 0.5, -0.5))
-        axes.set_xlim(0, 1.14 * axes.get_xlim()[1])
-        axes.grid(False, axis="y")
-        axes.tick_params(axis="y", length=0)
-    return figure

@@ -1,0 +1,56 @@
+"""Which part of which walk to show: one in which the robot turns and goes on.
+
+Of a stretch of walking, the product of its mean turn |v_r - v_l| and of the distance between its ends is taken. A robot
+that turns on the spot has a distance of zero, one that walks straight ahead a turn of zero; a robot that walks around
+something has both.
+
+Works on host arrays.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
+
+STRETCH = 10.0  # s, by which walks are compared
+_EVERY = 15  # frames between two stretches that are compared
+
+
+def select_walk(record: Record) -> int:
+    """Return the number of the robot with the best stretch of walking; axes (robot, frame).
+
+    Robots with more collisions come later, robots that were lost last.
+    """
+    frames = min(round(STRETCH * FRAME_RATE), np.shape(record.time)[1])
+    best = [
+        _turn_and_distance(np.asarray(position), np.asarray(velocity), frames).max()
+        for position, velocity in zip(record.position, record.velocity, strict=True)
+    ]
+    return int(np.argmax(np.array(best) - 1e3 * record.contact.sum(axis=1) - 1e6 * ~record.ok[:, -1]))
+
+
+def select_segment(
+    position: Float[ndarray, "total 3"], velocity: Float[ndarray, "total 2"], frames: int
+) -> Int[ndarray, " frames"]:
+    """Return the best consecutive frames of one walk, if possible without a reset."""
+    frames = min(max(frames, 1), len(position))
+    first = _EVERY * int(np.argmax(_turn_and_distance(position, velocity, frames)))
+    return np.arange(first, first + frames)
+
+
+def detect_resets(position: Float[ndarray, "frames 3"]) -> Bool[ndarray, " steps"]:
+    """Find the steps between frames in which the robot was reset: it can't walk 5 cm in 1/30 s."""
+    return np.linalg.norm(np.diff(position, axis=0), axis=1) > 0.05
+
+
+def _turn_and_distance(
+    position: Float[ndarray, "total 3"], velocity: Float[ndarray, "total 2"], frames: int
+) -> Float[ndarray, " starts"]:
+    """Return mean turn times distance [m] of every stretch of `frames`; less 1000 for each reset in it."""
+    starts = np.arange(0, len(position) - frames + 1, _EVERY)
+    turn = np.concatenate([[0.0], np.cumsum(np.abs(velocity[:, 1] - velocity[:, 0]))])
+    resets = np.concatenate([[0.0, 0.0], np.cumsum(detect_resets(position))])
+    distance = np.linalg.norm(position[starts + frames - 1, :2] - position[starts, :2], axis=1)
+    crossed = resets[starts + frames] - resets[starts + 1]
+    return (turn[starts + frames] - turn[starts]) / frames * distance - 1e3 * crossed
