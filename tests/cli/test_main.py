@@ -165,7 +165,7 @@ def test_trials_and_policies_are_compared_line_by_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     outcomes = {
-        "testing": {"per_100_m": {}, "collisions": 3, "distance": 41.2},
+        "testing": {"per_100_m": {}, "collisions": 3, "distance": 41.2, "progress": {"coverage": {"value": 18.21}}},
         "indoor": {"robots": 12, "untouched": 11, "passed": 3, "retreated": 8},
     }
 
@@ -178,8 +178,8 @@ def test_trials_and_policies_are_compared_line_by_line(
     monkeypatch.setattr("lgmdjax.evaluation.run_trial.run_trial", run_trial)
     assert main.main(["trial", "testing", "indoor", "--policy", "blind", "learned", "blind"]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"testing, blind: 3 collisions in 41 m; look into {tmp_path / 'testing-blind'}",
-        f"testing, learned: 3 collisions in 41 m; look into {tmp_path / 'testing-learned'}",
+        f"testing, blind: 3 collisions in 41 m, 18.2 new cells a minute; look into {tmp_path / 'testing-blind'}",
+        f"testing, learned: 3 collisions in 41 m, 18.2 new cells a minute; look into {tmp_path / 'testing-learned'}",
         f"indoor, blind: 11 of 12 untouched; 3 passed, 8 turned back; look into {tmp_path / 'indoor-blind'}",
         f"indoor, learned: 11 of 12 untouched; 3 passed, 8 turned back; look into {tmp_path / 'indoor-learned'}",
     ]

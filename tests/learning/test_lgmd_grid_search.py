@@ -32,6 +32,7 @@ def record(proximity: np.ndarray, turning: np.ndarray | bool = False, **fields: 
         "feed_forward": np.zeros((robots, frames, 2)),
         "excitation": np.zeros((robots, frames, 2)),
         "distances": 1 / proximity,
+        "corridor": 1 / proximity,
         "label": 1.2 + steering,
         "velocity": 1.2 + steering,
         "clearance": np.ones((robots, frames)),

@@ -55,8 +55,8 @@ def test_fingerprint_depends_on_every_number_and_on_the_camera(robot):
 def test_placeholders_walk_straight():
     """What is not given: the teacher's base velocity for policies blind and random."""
     switch = assembly.make_policies()
-    np.testing.assert_allclose(switch.policies[2].velocity, 1.2)
-    np.testing.assert_allclose(switch.policies[4].velocities, np.full((assembly.REPLAY_LENGTH, 2), 1.2))
+    np.testing.assert_allclose(switch.policies[2].velocity, 1.3)
+    np.testing.assert_allclose(switch.policies[4].velocities, np.full((assembly.REPLAY_LENGTH, 2), 1.3))
 
 
 def test_a_folder_without_the_files_of_its_stage_is_refused(tmp_path):
