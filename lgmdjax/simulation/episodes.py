@@ -292,7 +292,7 @@ def _read(path: Path, version: int) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
     table = table.rename_columns([RENAMED[version].get(name, name) for name in table.column_names])
-    if version in NEAREST_ONLY and "corridor_left" not in table.column_names:
+    if version in NEAREST_ONLY:
         for side in SIDES:
             table = table.append_column(f"corridor_{side}", table[f"distance_{side}"])
     if missing := set(COLUMNS) - set(table.column_names):
