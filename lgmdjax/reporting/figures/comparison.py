@@ -57,6 +57,8 @@ def plot_collisions_against_coverage(scores: Scores) -> Figure:
         axes.set_xlim(left=0)
         axes.set_ylim(bottom=0)
     panels[0].set_ylabel("collisions per 100 m")
+    handles, names = panels[0].get_legend_handles_labels()  # names beside the dots would cover each other
+    figure.legend(handles, names, loc="outside upper right", ncols=len(names))
     return figure
 
 
@@ -64,7 +66,5 @@ def _add_policy(axes: Axes, name: str, score: JsonObject) -> None:
     rate, coverage, colour = score["per_100_m"], score["progress"]["coverage"], POLICY_COLOURS.get(name, GREY)
     axes.plot([coverage["low"], coverage["high"]], [rate["value"]] * 2, color=colour, linewidth=1.6, alpha=0.6)
     axes.plot([coverage["value"]] * 2, [rate["low"], rate["high"]], color=colour, linewidth=1.6, alpha=0.6)
-    axes.plot([coverage["value"]], [rate["value"]], "o", color=colour, markersize=5.5, clip_on=False, zorder=3)
-    axes.annotate(
-        name, (coverage["value"], rate["value"]), xytext=(5, 5), fontsize=8, color=colour, textcoords="offset points"
-    )
+    dot = {"marker": "o", "markersize": 5.5, "linestyle": "none", "clip_on": False, "zorder": 3}
+    axes.plot([coverage["value"]], [rate["value"]], color=colour, label=name, **dot)
