@@ -25,7 +25,7 @@ from lgmdjax.pipeline.settings import EvaluateSettings
 
 FlagsT = TypeVar("FlagsT")
 MAX_NAME = 200  # characters of the name that a run folder gets from its changed settings
-MAY_BE_ZERO = ("dagger-rounds",)
+MAY_BE_ZERO = ("dagger-rounds", "ground", "falloff")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -155,7 +155,7 @@ def _scaled_size(path: Path, video: video_io.Video, layout: StereoLayout) -> tup
 def _split(picture: UInt8[np.ndarray, "height width"], layout: StereoLayout) -> Float[np.ndarray, "2 height eye"]:
     """Cut the pictures of both eyes out of one frame."""
     pictures = np.split(picture, 2, axis=1) if layout.stereo else [picture, picture]
-    crops = [hemifield.crop(whole, side, layout.overlap) for side, whole in enumerate(pictures)]
+    crops = [hemifield.crop(whole, side, overlap=layout.overlap) for side, whole in enumerate(pictures)]
     return np.stack(crops).astype(jnp.result_type(float))
 
 

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, PyTree
 from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
 from lgmdjax.locomotion import cpg, shaping
+from lgmdjax.sensors import hemifield
 
 
 @struct.dataclass(kw_only=True)
@@ -61,11 +62,12 @@ def init(params: Params, frames: Float[Array, "2 height width"], policy: Policy,
 
 def init_lgmd(params: Params, frames: Float[Array, "2 height width"]) -> lgmd.State:
     """Return the states of both LGMDs at a first stereo frame, so that their first frame difference is zero."""
-    return jax.vmap(lgmd.init, in_axes=(None, 0))(params.lgmd, frames)
+    return jax.vmap(lgmd.init, in_axes=(None, 0))(params.lgmd, hemifield.outermost_first(frames))
 
 
 def detect(params: Params, state: State, frames: Float[Array, "2 height width"]) -> tuple[State, lgmd.Response]:
     """Step both LGMDs by one stereo frame (eqs. 7-16); the response has one entry for each eye, left first."""
+    frames = hemifield.outermost_first(frames)
     lgmd_state, response = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(params.lgmd, state.lgmd, frames)
     return replace(state, lgmd=lgmd_state), response
 

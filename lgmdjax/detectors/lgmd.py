@@ -18,6 +18,7 @@ response.
 | U_f/n     | response.excitation         | grey        | 13, 14   |
 | u_f       | response.u                  | 1, 0.5..1   | 14, 16   |
 | FF        | response.feed_forward       | grey        | 15       |
+| w         | column_weights              | 1           | -        |
 | T_f       | suppression                 | grey        | 16       |
 
 Source: Cizek & Faigl, sec. 3.3; Blanchard, Rind & Verschure 2000. Two equations contradict the text as printed and are
@@ -33,6 +34,14 @@ difference between the u of the two eyes correlates with that of nearness as fol
 | ------- | ---- |
 | 1       | 0.14 |
 | 8       | 0.8  |
+
+With a `falloff` p the means of eqs. 13 and 15 are weighted by the bearing theta of a cell's column:
+
+    w(theta) = min(1, sin(theta_0) / sin(theta))^p,  theta_0 = 20 degrees,
+
+divided by the mean of all w. An obstacle that a robot passes at a distance y from its path moves across the image at
+v sin(theta)^2 / y, fastest when it is beside the robot and no longer matters; p = 2 compensates for that. The first
+column of a frame is then the outermost one, for the right eye too (`hemifield.outermost_first`).
 
 The kernel sums to 2.92, times W_I to 1.168: where a change repeats itself, summation is negative, and only new edges
 pass. The frame after `init` has no last change yet, hence no inhibition.
@@ -56,6 +65,7 @@ from lgmdjax.errors import InputError
 
 KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
 U_AT_REST = 0.5  # u without motion
+FULL_WEIGHT_BEARING = math.radians(20.0)  # theta_0, up to which all cells have the same weight
 
 # w_I (eq. 9)
 KERNEL = (
@@ -81,6 +91,8 @@ class Params:
     threshold_width: Float[Array, ""] | float = 1.0  # grey, of the sigmoid at T_s
     suppression_width: Float[Array, ""] | float = 1.0  # grey, of the sigmoid at T_f
     pooling: int = struct.field(pytree_node=False, default=1)  # px, side of the square that a cell averages
+    falloff: float = struct.field(pytree_node=False, default=0.0)  # p; 0 as in the paper
+    edges: tuple[float, float] = struct.field(pytree_node=False, default=(math.radians(85.0), 0.0))  # bearing, rad
     smooth: bool = struct.field(pytree_node=False, default=False)  # sigmoids instead of steps
     printed_feed_forward: bool = struct.field(pytree_node=False, default=False)  # eq. 15: signed mean
     printed_gate: bool = struct.field(pytree_node=False, default=False)  # eq. 16: low FF suppresses
@@ -224,6 +236,11 @@ def check(params: Params) -> None:
         value = np.asarray(getattr(params, name), dtype=float)
         if not np.all(np.isfinite(value) & (value >= 0)):
             raise InputError(f"lgmd {name}: expected finite numbers >= 0, got {value.min()}; see lgmd.Params")
+    if not (0 <= params.falloff < math.inf and all(abs(edge) <= math.pi for edge in params.edges)):
+        raise InputError(
+            f"lgmd falloff: expected a finite number >= 0 and edges within pi rad, got {params.falloff} and "
+            f"{params.edges}; 0 gives all cells the same weight"
+        )
     if params.pooling < 1:
         raise InputError(f"lgmd pooling: expected 1 pixel or more a cell, got {params.pooling}; the paper has 1")
     for name in ("threshold_width", "suppression_width"):
@@ -243,7 +260,7 @@ def _mean_excitation(params: Params, summation: Float[Array, "height width"]) ->
     S, margin = summation, summation - params.threshold
     sigmoid = params.smooth
     passed = S * jax.nn.sigmoid(margin / params.threshold_width) if sigmoid else jnp.where(margin >= 0, S, 0.0)
-    return _mean(jnp.abs(passed))
+    return _mean(params, jnp.abs(passed))
 
 
 def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
@@ -254,7 +271,7 @@ def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
 
 def _feed_forward(params: Params, difference: Float[Array, "height width"]) -> Float[Array, ""]:
     """Return FF, the mean magnitude of the last change (eq. 15), or the mean of the change itself as printed."""
-    return _mean(difference if params.printed_feed_forward else jnp.abs(difference))
+    return _mean(params, difference if params.printed_feed_forward else jnp.abs(difference))
 
 
 def _gate(params: Params, FF: Float[Array, ""]) -> Float[Array, ""]:
@@ -266,10 +283,22 @@ def _gate(params: Params, FF: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(is_high if params.printed_gate else ~is_high, jnp.ones_like(FF), jnp.zeros_like(FF))
 
 
-def _mean(cells: Float[Array, "height width"]) -> Float[Array, ""]:
-    """Return the mean over all cells, with rows summed by a product with ones: XLA's sum on a CPU is not vectorised."""
-    ones = jnp.ones(cells.shape[1], cells.dtype)
-    return jnp.sum(jnp.matmul(cells, ones, precision=lax.Precision.HIGHEST)) / cells.size
+def column_weights(params: Params, columns: int) -> Float[np.ndarray, " columns"]:
+    """Return the weight of each column of cells, the outermost first; their mean is 1.
+
+    >>> column_weights(Params(falloff=2.0), 4).round(2).tolist()
+    [0.29, 0.42, 0.97, 2.31]
+    """
+    outer, inner = params.edges
+    theta = np.abs(outer + (inner - outer) * (np.arange(columns) + 0.5) / columns)
+    weights = np.minimum(1.0, math.sin(FULL_WEIGHT_BEARING) / np.maximum(np.sin(theta), 1e-9)) ** params.falloff
+    return weights / weights.mean()
+
+
+def _mean(params: Params, cells: Float[Array, "height width"]) -> Float[Array, ""]:
+    """Return the weighted mean over all cells, by a product, since XLA's sum on a CPU is not vectorised."""
+    weights = jnp.asarray(column_weights(params, cells.shape[1]), cells.dtype)
+    return jnp.sum(jnp.matmul(cells, weights, precision=lax.Precision.HIGHEST)) / cells.size
 
 
 def _require_frame(frame: Array) -> None:

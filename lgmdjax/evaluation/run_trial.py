@@ -13,7 +13,7 @@ After an interruption the same call continues with the next batch.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import jax
@@ -119,7 +119,7 @@ def _scale_camera(robot: closed_loop.Params, width: int) -> CameraSettings:
             f"try {2 * camera.width}"
         )
     height, cell = camera.height * width // camera.width, pooling * width // camera.width
-    return CameraSettings(width=width, height=height, overlap=camera.overlap, pooling=cell)
+    return replace(assembly.camera_settings(robot), width=width, height=height, pooling=cell)
 
 
 def describe_run(

@@ -42,7 +42,7 @@ from scipy import ndimage
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation.metrics import AVERAGING_TIME
-from lgmdjax.sensors import camera
+from lgmdjax.sensors import camera, hemifield
 from lgmdjax.simulation import rerender, rollout, sharding
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
 from lgmdjax.world import arena
@@ -102,7 +102,7 @@ def evaluate(
 
     def step(room: arena.Arena, state: lgmd.State, row: tuple[Array, ...]):
         is_first, *pose = row
-        images = rerender.render_pose(camera_params, room, *pose)
+        images = hemifield.outermost_first(rerender.render_pose(camera_params, room, *pose))
         state = jax.tree.map(partial(jnp.where, is_first), init_both(images), state)
         state, u, FF = jax.vmap(respond_all, in_axes=(None, 0, 0))(candidates, state, images)
         return state, (u, FF)

@@ -50,7 +50,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, see
 
 def _calibrate(gait: Path, settings: CollectSettings, seed: int) -> JsonObject:
     """Record walks of the teacher without rendering, render them for all candidates, and select the thresholds."""
-    detector = lgmd.Params(pooling=settings.eyes.pooling)
+    detector = assembly.fit_detector(lgmd.Params(), settings.eyes)
     params = assembly.with_policy(
         _teacher_robot(gait, settings, detector),
         "teacher",

@@ -33,7 +33,8 @@ from lgmdjax.pipeline.settings import ReportSettings
 from lgmdjax.reporting import walk_video
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime.storage import JsonObject, read_arrays, replacing
-from lgmdjax.sensors import camera
+from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.simulation import assembly
 from lgmdjax.studies import supervision, velocity
 from lgmdjax.world import arena, scenes
 
@@ -90,9 +91,7 @@ def _contents(run_folder: Path, room: arena.Arena, video_seconds: float) -> Json
     results = report_data.read_results(run_folder)
     onset, layers = read_arrays(run_folder / "fit-gait/cpg.npz"), read_arrays(run_folder / "evaluate/layers.npz")
     size = next(plan["eyes"] for plan in results.settings["evaluate"]["trials"] if plan["trial"] == "testing")
-    camera_params = camera.Params(
-        width=size["width"], height=size["height"], overlap=float(results.calibration["overlap"])
-    )  # fmt: skip
+    camera_params = assembly.camera_params(CameraSettings(**size))
     return {
         **results._asdict(),
         "figures": _figures(run_folder, results, onset, room),

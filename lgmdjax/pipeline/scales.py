@@ -46,10 +46,11 @@ StudySettings = (
     | FinetuneSettings
 )
 
-_SMALL = CameraSettings(width=64, height=48, pooling=2)
-_QUICK = CameraSettings(width=80, height=60, pooling=3)
-_MEDIUM = CameraSettings(width=160, height=120, pooling=6)
-_PAPER = CameraSettings(width=320, height=240, pooling=12)
+_FIELD: Mapping[str, float] = {"ground": 0.5, "falloff": 2.0}  # of the LGMDs (`lgmdjax.sensors.settings`)
+_SMALL = CameraSettings(width=64, height=48, pooling=2, **_FIELD)
+_QUICK = CameraSettings(width=80, height=60, pooling=3, **_FIELD)
+_MEDIUM = CameraSettings(width=160, height=120, pooling=6, **_FIELD)
+_PAPER = CameraSettings(width=320, height=240, pooling=12, **_FIELD)
 
 SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
     "smoke": {

@@ -11,6 +11,7 @@ are dimmed.
 import io
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -33,7 +34,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.reporting import selection, third_person, video_io
 from lgmdjax.reporting.figures.style import DARK, LEFT_COLOUR, LIGHT_GREY, RED, RIGHT_COLOUR, STYLE
 from lgmdjax.reporting.third_person import RobotCapsules, Viewpoint
-from lgmdjax.sensors import camera
+from lgmdjax.sensors import camera, hemifield
 from lgmdjax.simulation import assembly, closed_loop
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena
@@ -138,7 +139,7 @@ def write_trace(
         target: path of the file, or a binary stream.
         trace: the walk.
         room: the room of the walk.
-        eyes: camera of the eyes. Images are rendered in full width, and dimmed outside the width that `overlap` gives.
+        eyes: camera of the eyes. Images are rendered in full width, and dimmed where the LGMDs do not see them.
         seconds: duration of the video; it is shorter if the walk is.
     """
     _check(trace)
@@ -147,7 +148,7 @@ def write_trace(
     page = _Page(trace, frames, (eyes.width, eyes.height))
     with video_io.open_writer(target, *VIDEO_SIZE, VIDEO_RATE) as write:
         for index, (view, eye_images) in enumerate(_render(views, robot, room, eyes)):
-            write(page.compose(view, eye_images, frames[index * FRAME_STRIDE], eyes.overlap))
+            write(page.compose(view, eye_images, frames[index * FRAME_STRIDE], eyes))
     return len(views.time)
 
 
@@ -233,7 +234,7 @@ def _render(
 ) -> Iterator[tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "2 rows columns"]]]:
     """Render the views in chunks of one size, two at a time; the last chunk is padded."""
     count = len(views.time)
-    render = _renderer(third_person.Params(), eyes.replace(overlap=1.0))  # pyright: ignore[reportAttributeAccessIssue]
+    render = _renderer(third_person.Params(), replace(eyes, overlap=1.0, ground=0.0))
     room = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), room)
 
     def render_chunk(first: int) -> tuple[ndarray, ndarray]:
@@ -274,7 +275,11 @@ class _Page:
         self.column = dict(zip(frames.tolist(), np.round(columns).astype(int).tolist(), strict=True))
 
     def compose(
-        self, view: UInt8[ndarray, "h w 3"], eye_images: UInt8[ndarray, "2 rows columns"], frame: int, overlap: float
+        self,
+        view: UInt8[ndarray, "h w 3"],
+        eye_images: UInt8[ndarray, "2 rows columns"],
+        frame: int,
+        eyes: camera.Params,
     ) -> UInt8[ndarray, "height width 3"]:
         """Compose one image of the video: views, and curves up to the frame; red border around a contact."""
         page, now, top = self.blank.copy(), self.column[frame], CURVE_BOXES[0][1] - 8
@@ -285,9 +290,9 @@ class _Page:
         for side, (image, box, colour) in enumerate(
             zip(eye_images, EYE_BOXES, (LEFT_COLOUR, RIGHT_COLOUR), strict=True)
         ):
-            in_hemifield = np.arange(image.shape[1]) < overlap * image.shape[1]
-            in_hemifield = in_hemifield if side == 0 else in_hemifield[::-1]
-            dimmed = (image * np.where(in_hemifield, 1.0, DIMMING)).astype(np.uint8)
+            field = {"overlap": eyes.overlap, "ground": eyes.ground}
+            dimmed = (DIMMING * image).astype(np.uint8)
+            hemifield.crop(dimmed, side, **field)[:] = hemifield.crop(image, side, **field)
             _paste(page, np.repeat(dimmed[..., None], 3, axis=-1), box, colour)
         return page
 

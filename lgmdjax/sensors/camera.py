@@ -55,6 +55,8 @@ class Params:
     """Field of view over the whole width [rad]."""
     overlap: float = struct.field(pytree_node=False, default=1.0)
     """Fraction of the width that each eye renders, from its own side: 0.5 (its half) .. 1 (all)."""
+    ground: float = struct.field(pytree_node=False, default=0.0)
+    """Fraction of the height, at the bottom, that no eye renders: 0 (none) .. less than 1."""
     samples: int = struct.field(pytree_node=False, default=1)
     """Rays per pixel along each side; one is enough, since a ray stands for an area."""
     tile_capacity: int = struct.field(pytree_node=False, default=6)
@@ -69,8 +71,7 @@ class Params:
                 raise InputError(f"expected camera {name} as a whole number above 0, got {value!r}; change it")
         if self.bands > len(WAVES):
             raise InputError(f"expected at most {len(WAVES)} texture bands, got {self.bands}; lower camera bands")
-        if not 0.5 <= self.overlap <= 1.0:
-            raise InputError(f"expected a camera overlap in 0.5..1, got {self.overlap!r}; change it")
+        hemifield.check(self.overlap, self.ground)
         if not 0.0 < self.fov * math.hypot(1.0, self.height / self.width) < 2.0 * math.pi:
             raise InputError(
                 f"expected a camera fov above 0 with corners less than pi rad from the middle, got {self.fov!r} rad "
@@ -80,7 +81,8 @@ class Params:
 
 def image_shape(params: Params) -> tuple[int, int, int]:
     """Return the shape of a stereo pair: eyes, rows, columns."""
-    return 2, params.height, hemifield.column_count(params.width, params.overlap)
+    rows = hemifield.row_count(params.height, params.ground)
+    return 2, rows, hemifield.column_count(params.width, params.overlap)
 
 
 def render(
@@ -91,7 +93,8 @@ def render(
 ) -> Float[Array, "2 height columns"]:
     """Render the images of the left and the right eye, in grey levels 0..255.
 
-    With an `overlap` below 1 the left image has the first columns, the right image the last ones (`image_shape`).
+    Images have the columns of each eye's hemifield (`hemifield.crop`): with an `overlap` below 1 the left image has the
+    first columns and the right image the last ones, and neither has the rows of the `ground`.
 
     Gradient: through the coverage of outlines and through depths and textures; zero through the choice of prisms that
     a tile holds.

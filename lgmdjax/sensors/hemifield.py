@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
 
@@ -20,21 +20,58 @@ def column_count(width: int, overlap: float) -> int:
     return math.ceil(overlap * width - 1e-9)  # a rounding error adds no column
 
 
-def crop(image: Array | np.ndarray, side: int, overlap: float) -> Array | np.ndarray:
-    """Return the hemifield of an eye: the first columns for the left eye, the last columns for the right eye.
+def row_count(height: int, ground: float = 0.0) -> int:
+    """Return the number of rows of a hemifield, from the top; those at the bottom are the `ground`.
 
-    >>> crop(np.arange(8), RIGHT, overlap=0.5)
-    array([4, 5, 6, 7])
+    >>> row_count(60), row_count(60, ground=0.5)
+    (60, 30)
+    """
+    return max(math.ceil((1 - ground) * height - 1e-9), 1)
+
+
+def crop(image: Array | np.ndarray, side: int, *, overlap: float, ground: float = 0.0) -> Array | np.ndarray:
+    """Return the hemifield of an eye: columns from its own side, the mirrored ones for the right eye.
+
+    >>> picture = np.arange(16).reshape(2, 8)
+    >>> crop(picture, RIGHT, overlap=0.5).tolist()
+    [[4, 5, 6, 7], [12, 13, 14, 15]]
+    >>> crop(picture, RIGHT, overlap=0.5, ground=0.5).tolist()
+    [[4, 5, 6, 7]]
 
     Args:
         image: the whole image of that eye, (..., height, width).
         side: `LEFT` or `RIGHT`.
         overlap: fraction of the width to keep; 0.5 is no overlap, 1 the whole image.
+        ground: fraction of the height, at the bottom, that is left out.
     """
-    if not 0.5 <= overlap <= 1:
-        raise InputError(f"lgmd overlap: expected a fraction of the width in 0.5..1, got {overlap}; 0.5 is no overlap")
+    check(overlap, ground)
     if side not in (LEFT, RIGHT):
         raise InputError(f"lgmd side: expected 0 (left) or 1 (right), got {side}; see hemifield.LEFT, hemifield.RIGHT")
-    width = jnp.shape(image)[-1]
+    height, width = jnp.shape(image)[-2:]
     columns = column_count(width, overlap)
-    return image[..., :columns] if side == LEFT else image[..., width - columns :]
+    seen = image[..., : row_count(height, ground), :]
+    return seen[..., :columns] if side == LEFT else seen[..., width - columns :]
+
+
+def edges(fov: float, overlap: float) -> tuple[float, float]:
+    """Return the bearings [rad] of the outer and of the inner edge of a hemifield, positive on the eye's own side.
+
+    >>> edges(2.0, overlap=0.5)
+    (1.0, 0.0)
+    """
+    return 0.5 * fov, fov * (0.5 - overlap)
+
+
+def outermost_first(frames: Float[Array, "2 height columns"]) -> Float[Array, "2 height columns"]:
+    """Mirror the picture of the right eye: in both pictures the first column is then that of the largest bearing."""
+    return jnp.stack([frames[LEFT], frames[RIGHT, :, ::-1]])
+
+
+def check(overlap: float, ground: float) -> None:
+    """Raise `InputError` for a hemifield that is not possible."""
+    if not 0.5 <= overlap <= 1:
+        raise InputError(f"lgmd overlap: expected a fraction of the width in 0.5..1, got {overlap}; 0.5 is no overlap")
+    if not 0 <= ground < 1:
+        raise InputError(
+            f"lgmd ground: expected a fraction of the height from 0 to less than 1, got {ground}; 0 leaves nothing out"
+        )

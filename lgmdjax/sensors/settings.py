@@ -18,5 +18,9 @@ class CameraSettings:
     """height of each eye's image [px]"""
     overlap: float = 0.5
     """fraction of the width that each LGMD receives, from its own side: 0.5 to 1"""
+    ground: float = 0.0
+    """fraction of the height, at the bottom, that no LGMD receives; 0.5 is all below the horizon"""
+    falloff: float = 0.0
+    """how much less the LGMDs weigh what is beside than what is ahead (`lgmdjax.detectors.lgmd`); 0 is not at all"""
     pooling: int = 1
     """width of a detector's cell [px]"""

@@ -1,7 +1,7 @@
 """Robots assembled from the files of a run, or from those of the package."""
 
 import hashlib
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import jax
@@ -16,7 +16,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.locomotion import shaping
 from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.runtime.storage import read_arrays, read_json
-from lgmdjax.sensors import camera
+from lgmdjax.sensors import camera, hemifield
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import closed_loop
 
@@ -26,7 +26,20 @@ CALIBRATED = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
 
 def camera_params(settings: CameraSettings) -> camera.Params:
     """Return the stereo camera of these settings."""
-    return camera.Params(width=settings.width, height=settings.height, overlap=settings.overlap)
+    of_detector = ("pooling", "falloff")
+    return camera.Params(**{name: value for name, value in asdict(settings).items() if name not in of_detector})
+
+
+def camera_settings(robot: closed_loop.Params) -> CameraSettings:
+    """Return the settings that `with_camera` gave a robot."""
+    of_camera = {name: getattr(robot.camera, name) for name in ("width", "height", "overlap", "ground")}
+    return CameraSettings(**of_camera, pooling=robot.controller.lgmd.pooling, falloff=robot.controller.lgmd.falloff)
+
+
+def fit_detector(detector: lgmd.Params, settings: CameraSettings) -> lgmd.Params:
+    """Return the LGMD with cells of the size, the bearings and the weights that the camera's settings give."""
+    edges = hemifield.edges(camera.Params().fov, settings.overlap)
+    return replace(detector, pooling=settings.pooling, falloff=settings.falloff, edges=edges)
 
 
 def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAINED_DIR) -> closed_loop.Params:
@@ -104,7 +117,7 @@ def with_camera(params: closed_loop.Params, settings: CameraSettings) -> closed_
 
     `settings.pooling` keeps the visual angle of an LGMD cell, so that its responses change little.
     """
-    lgmd_params = replace(params.controller.lgmd, pooling=settings.pooling)
+    lgmd_params = fit_detector(params.controller.lgmd, settings)
     return replace(params, camera=camera_params(settings), controller=replace(params.controller, lgmd=lgmd_params))
 
 

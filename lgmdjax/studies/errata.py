@@ -32,7 +32,6 @@ from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import compiled_code, storage
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, recording
 from lgmdjax.studies import supervision
 from lgmdjax.studies.settings import ErrataSettings
@@ -92,10 +91,7 @@ def _with_printed_shaping(robot: closed_loop.Params, folder: Path) -> closed_loo
 
 def _with_whole_pictures(robot: closed_loop.Params, _: Path) -> closed_loop.Params:
     """Give each detector the whole picture of its camera."""
-    camera_params = robot.camera
-    whole = CameraSettings(
-        width=camera_params.width, height=camera_params.height, overlap=1.0, pooling=robot.controller.lgmd.pooling
-    )
+    whole = replace(assembly.camera_settings(robot), overlap=1.0, ground=0.0, falloff=0.0)
     return assembly.with_camera(robot, whole)
 
 

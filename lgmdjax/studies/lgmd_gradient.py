@@ -55,6 +55,7 @@ from lgmdjax.learning.settings import LgmdGradientSettings
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
 from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.sensors import hemifield
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, episodes, rerender, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, AnyArray
@@ -131,7 +132,7 @@ def rerender_segments(
     """
     walks, differences = list[Walk](), []
     detector = robot.controller.lgmd
-    same = assembly.camera_params(teacher_camera) == robot.camera and teacher_camera.pooling == detector.pooling
+    same = teacher_camera == assembly.camera_settings(robot)
     for robots, segments in tqdm(sampled, desc="rendering", unit="episode"):
         episode, numbers = segments[0].episode, np.array([walk.room % robots for walk in segments])
         rooms = room_batches.training_rooms(segments[0].seed, episode, robots).arena
@@ -213,8 +214,10 @@ def detector_constants(detector: lgmd.Params) -> JsonObject:
 
 @jax.jit
 def _pooled(detector: lgmd.Params, pictures: Float[AnyArray, "walks frames 2 height columns"]) -> Array:
-    pool = jax.vmap(jax.vmap(partial(lgmd.pool, detector)))
-    return jax.lax.map(pool, jnp.asarray(pictures))
+    def pool(pair: Float[Array, "2 height columns"]) -> Float[Array, "2 rows cells"]:
+        return jax.vmap(partial(lgmd.pool, detector))(hemifield.outermost_first(pair))
+
+    return jax.lax.map(jax.vmap(pool), jnp.asarray(pictures))
 
 
 def _select(part: Sequence[Walk], rendered: RenderedWalks) -> RenderedWalks:

@@ -36,8 +36,15 @@ def lgmd(
     inhibition: float = 0.4,
     printed_feed_forward: bool = False,
     printed_gate: bool = False,
+    falloff: float = 0.0,
+    outer: float = 85.0,
+    inner: float = 0.0,
 ) -> list[dict[str, Any]]:
-    """Run eqs. 7-16 over a sequence of frames. The first frame has no predecessor, and nothing changed before it."""
+    """Run eqs. 7-16 over a sequence of frames. The first frame has no predecessor, and nothing changed before it.
+
+    With a `falloff` the sums of eqs. 13 and 15 have weights by bearing, from `outer` to `inner` [degrees] across the
+    frame; their number n_cell becomes the sum of the weights.
+    """
     P_before, L_before = np.zeros(frames[0].shape), frames[0]
     out = []
     for L in frames[1:]:
@@ -45,12 +52,16 @@ def lgmd(
         I = inhibition_layer(P_before)  # eq. 8  # noqa: E741
         E = np.abs(P)  # eq. 10
         S = E - np.abs(I) * inhibition  # eq. 11
-        U, n_cell = 0.0, 0
-        for s in S.ravel():  # eqs. 12, 13
-            n_cell += 1
-            U += abs(s) if s >= threshold else 0.0
+        U, FF, n_cell = 0.0, 0.0, 0.0
+        for (row, column), s in np.ndenumerate(S):  # eqs. 12, 13, 15
+            bearing = abs(outer + (inner - outer) * (column + 0.5) / S.shape[1])
+            weight = 1.0 if bearing <= 20 else (math.sin(math.radians(20)) / math.sin(math.radians(bearing))) ** falloff
+            n_cell += weight
+            U += weight * abs(s) if s >= threshold else 0.0
+            change = P_before[row, column]
+            FF += weight * (change if printed_feed_forward else abs(change))
         u = 1 / (1 + math.exp(-U / n_cell))  # eq. 14
-        ff = (P_before if printed_feed_forward else np.abs(P_before)).sum() / n_cell  # eq. 15
+        ff = FF / n_cell  # eq. 15
         shown = ff > suppression if printed_gate else not ff > suppression  # eq. 16
         out.append({"u": u if shown else 0.5, "feed_forward": ff, "excitation": U / n_cell, "E": E, "I": I, "S": S})
         P_before, L_before = P, L

@@ -108,14 +108,14 @@ def test_a_batch_of_robots_renders_the_image_of_each(render_small):
         np.testing.assert_allclose(image, render_small(room, *pose), atol=1e-9)
 
 
-@pytest.mark.parametrize("overlap", [0.5, 0.6])
-def test_overlap_renders_the_same_columns(render_small, overlap):
+@pytest.mark.parametrize("field", [{"overlap": 0.6}, {"overlap": 0.5, "ground": 0.5}])
+def test_a_part_of_the_field_has_the_same_pixels(render_small, field):
     room = scenes.indoor_scene()  # its tiles hold all prisms, even though they are laid out differently
     pose = eyes_at(room.start)
-    whole, part = render_small(room, *pose), camera.render(replace(SMALL, overlap=overlap), room, *pose)
-    assert part.shape == camera.image_shape(replace(SMALL, overlap=overlap))
+    whole, part = render_small(room, *pose), camera.render(replace(SMALL, **field), room, *pose)
+    assert part.shape == camera.image_shape(replace(SMALL, **field))
     for side in (hemifield.LEFT, hemifield.RIGHT):
-        np.testing.assert_allclose(part[side], hemifield.crop(whole[side], side, overlap), atol=1e-6)
+        np.testing.assert_allclose(part[side], hemifield.crop(whole[side], side, **field), atol=1e-6)
 
 
 def test_samples_are_the_mean_of_a_finer_image():
