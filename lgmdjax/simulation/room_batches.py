@@ -23,6 +23,7 @@ from lgmdjax.world.arena import Arena, sample_free_poses
 START_COUNT = 32  # starts of a room's robot, one for each reset, used in order
 BENCHMARK_EPISODE = 2**23  # episode number of `benchmark_rooms`; training episodes never get so far
 CONTRAST_RANGE = (0.3, 1.0)  # factors by which the contrast of training rooms is scaled
+OVERHEAD_SHARE = 0.2  # of the obstacles in training rooms
 
 
 @partial(jax.jit, static_argnames="count")
@@ -65,15 +66,21 @@ def stack_rooms(rooms: list[Room]) -> Room:
 
 
 def training_rooms(seed: int, episode: int, robots: int) -> Room:
-    """Return the random rooms of a training episode, with contrasts in `CONTRAST_RANGE`.
+    """Return the random rooms of a training episode, with contrasts in `CONTRAST_RANGE` and a few obstacles overhead.
 
     Rooms of low contrast are needed: a navigator trained only in rooms of high contrast hardly turns from the one
-    moving edge in front of a plain wall, since little motion then means little danger.
+    moving edge in front of a plain wall, since little motion then means little danger. Obstacles overhead are needed
+    for table tops and crowns of trees: a navigator that never walked under anything turns round in front of them.
     """
     key = jax.random.fold_in(jax.random.key(seed), episode)
     rooms = random_rooms(key, robots)
-    contrast = jax.random.uniform(jax.random.fold_in(key, robots), (robots,), jnp.float32, *CONTRAST_RANGE)
-    return replace(rooms, arena=jax.vmap(scenes.scale_contrast)(rooms.arena, contrast))
+    contrast_key, overhead_key = (jax.random.fold_in(key, robots + k) for k in range(2))
+    contrast = jax.random.uniform(contrast_key, (robots,), jnp.float32, *CONTRAST_RANGE)
+
+    def vary(arena: Arena, contrast: Array, key: Array) -> Arena:
+        return scenes.raise_obstacles(scenes.scale_contrast(arena, contrast), key, OVERHEAD_SHARE)
+
+    return replace(rooms, arena=jax.vmap(vary)(rooms.arena, contrast, jax.random.split(overhead_key, robots)))
 
 
 def benchmark_rooms(benchmark: BenchmarkRooms, seed: int, contrast: float = 1.0) -> Room:

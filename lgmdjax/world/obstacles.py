@@ -134,6 +134,27 @@ def move_prisms(prisms: Prisms, time: ArrayLike) -> Prisms:
     return dataclasses.replace(prisms, centre=centre, goal=centre)
 
 
+def raise_prisms(prisms: Prisms, samples: Float[Array, "n 4"], share: Float[Array, ""] | float) -> Prisms:
+    """Return the prisms with a share of them raised above the robot and widened, like table tops and crowns of trees.
+
+    Bottoms are 0.6 to 2 m above the floor, thicknesses 0.05 to 1.5 m, and sizes 1 to 3 times the former ones.
+
+    Args:
+        prisms: of one kind; inactive ones stay inactive.
+        samples: numbers in 0 .. 1: whether it is raised, its bottom, thickness and size.
+        share: of the prisms that are raised.
+    """
+    chosen, height, thickness, size = (samples[:, column] for column in range(4))
+    raised = (chosen < share) & ~is_inactive(prisms)
+    bottom = jnp.where(raised, 0.6 + 1.4 * height, prisms.bottom)
+    return dataclasses.replace(
+        prisms,
+        bottom=bottom,
+        top=jnp.where(raised, bottom + 0.05 + 1.45 * thickness, prisms.top),
+        half_size=jnp.where(raised[:, None], (1 + 2 * size[:, None]) * prisms.half_size, prisms.half_size),
+    )
+
+
 def mirror_prisms(prisms: Prisms) -> Prisms:
     """Return the mirror image of prisms in the x axis."""
     flip = jnp.asarray([1.0, -1.0], dtype=prisms.yaw.dtype)

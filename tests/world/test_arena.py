@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from derivatives import assert_derivatives_agree
 from reference import arena as reference
 
 from lgmdjax.errors import InputError
-from lgmdjax.world import arena, scenes
+from lgmdjax.simulation import room_batches
+from lgmdjax.world import arena, obstacles, scenes
 
 FIXED = {
     "training": scenes.training_room,
@@ -408,3 +410,19 @@ def test_invalid_rooms_are_rejected_with_one_line(path: str, value: object, mess
 def test_too_many_prisms_are_rejected() -> None:
     with pytest.raises(InputError, match="at most 12"):
         arena.make_prisms(np.zeros((13, 2)), 0.1, 1.0)
+
+
+def test_raised_obstacles_are_overhead_and_all_others_stay_as_they_are():
+    """The share is kept over many rooms; a raised obstacle is out of the robot's reach, and no padding is raised."""
+    rooms = room_batches.random_rooms(jax.random.key(5), 16).arena
+    raise_some = jax.vmap(partial(scenes.raise_obstacles, share=0.25))
+    raised = raise_some(rooms, jax.random.split(jax.random.key(6), 16))
+    arena.validate(raised)
+    counts = np.zeros(2, int)
+    for before, after in ((rooms.boxes, raised.boxes), (rooms.cylinders, raised.cylinders)):
+        overhead, active = np.asarray(arena.is_overhead(after)), ~np.asarray(obstacles.is_inactive(before))
+        assert not np.any(overhead & ~active)
+        counts += np.array([overhead.sum(), active.sum()])
+        for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+            np.testing.assert_array_equal(np.asarray(a)[~overhead], np.asarray(b)[~overhead])
+    assert 0.15 < counts[0] / counts[1] < 0.37
