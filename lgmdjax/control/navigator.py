@@ -8,9 +8,10 @@
 | chi            | weights                    | 1                 | 17       |
 
 Source: Cizek & Faigl, sec. 3.4 (fig. 7); Hochreiter & Schmidhuber 1997, with the forget gate and the initial
-weights of Keras. The network is a flax module, split once into its graph and a dictionary of weights, so that
-`step` is a pure function. Inputs are standardised and outputs rescaled by constants of the training data, which are not
-trained. The network then works around zero; the paper's must have learned the offsets and scales.
+weights of Keras. `step` is one frame of the closed loop, `run` many frames of parallel walks with a fast derivative;
+the equations of their cell are in `lgmdjax.control.lstm`. Inputs are standardised and outputs rescaled by constants of
+the training data, which are not trained. The network then works around zero; the paper's must have learned the offsets
+and scales.
 
 | variant           | what it is                                                                            |
 | ----------------- | ------------------------------------------------------------------------------------- |
@@ -31,15 +32,16 @@ from all obstacles ours turned to one side. The average has 5 to 9 % less square
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx, struct, traverse_util
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
+from lgmdjax.control import lstm
 from lgmdjax.control.names import VARIANTS, Variant
 from lgmdjax.errors import InputError
 from lgmdjax.runtime import storage, versions
@@ -49,6 +51,7 @@ UNITS = 32
 FILE = storage.TensorFile(
     format="lgmdjax navigator", version="2", name="a navigator", remedy="`lgmdjax train` makes one"
 )
+RECURRENT = ("lstm", "lstm-efference")
 SCALES = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 
@@ -80,18 +83,11 @@ class _Recurrent(nnx.Module):
         self.cell = nnx.OptimizedLSTMCell(inputs, units, kernel_init=jax.nn.initializers.glorot_uniform(), rngs=rngs)
         self.head = nnx.Linear(units, 2, kernel_init=jax.nn.initializers.glorot_uniform(), rngs=rngs)
 
-    def __call__(self, carry: tuple[Array, Array], inputs: Array) -> tuple[tuple[Array, Array], Array]:
-        carry, hidden = self.cell(carry, inputs)
-        return carry, self.head(hidden)
-
 
 class _FeedForward(nnx.Module):
     def __init__(self, units: int, rngs: nnx.Rngs):
         self.layer = nnx.Linear(2, units, kernel_init=jax.nn.initializers.glorot_uniform(), rngs=rngs)
         self.head = nnx.Linear(units, 2, kernel_init=jax.nn.initializers.glorot_uniform(), rngs=rngs)
-
-    def __call__(self, carry: tuple[Array, Array], inputs: Array) -> tuple[tuple[Array, Array], Array]:
-        return carry, self.head(jnp.tanh(self.layer(inputs)))
 
 
 def create(key: Array, variant: Variant = "lstm", units: int = UNITS, *, symmetric: bool = False) -> Params:
@@ -131,11 +127,40 @@ def step(params: Params, state: State, u: Float[Array, "2"]) -> tuple[State, Flo
     If the robot executes another velocity than the returned one (a limited one, or another policy's), the caller must
     put it into the state's `velocity`, the next input of `lstm-efference`.
     """
-    forward = jax.vmap(partial(_forward, params))
-    (cell, hidden), outputs = forward((state.cell, state.hidden), _views(params, u), _views(params, state.velocity))
-    # The second output, if there is one, belongs to the mirror image and is mirrored back.
-    velocity = jnp.mean(outputs.at[1:].set(outputs[1:, ::-1]), axis=0)
-    return State(hidden=hidden, cell=cell, velocity=velocity), velocity
+    inputs = _inputs(params, u, state.velocity)
+    memory = lstm.Memory(hidden=state.hidden, cell=state.cell)
+    if params.variant in RECURRENT:
+        memory, _ = lstm.step(_recurrence(params), memory, _drive(params, inputs))
+    velocity = _velocity(params, inputs, memory.hidden)
+    return State(hidden=memory.hidden, cell=memory.cell, velocity=velocity), velocity
+
+
+def run(
+    params: Params,
+    states: State,
+    u: Float[Array, "frames streams 2"],
+    is_first: Bool[Array, "frames streams"],
+    executed: Float[Array, "frames streams 2"] | None = None,
+) -> tuple[State, Float[Array, "frames streams 2"]]:
+    """Return the velocities of parallel streams, and their states after the last frame: many calls of `step` in one.
+
+    Args:
+        params: of all streams.
+        states: before the first frame, with a leading axis of streams.
+        u: of every frame.
+        is_first: whether a stream starts again from the initial state with this frame.
+        executed: the velocity before each frame, the further input of `lstm-efference`; the network's own if None.
+    """
+    if params.variant == "lstm-efference" and executed is None:
+        return _run_stepwise(params, states, u, is_first)
+    last = jnp.where(is_first[..., None], init(params).velocity, 0 if executed is None else executed)
+    inputs = _inputs(params, u, last)
+    memories = lstm.Memory(hidden=states.hidden[None], cell=states.cell[None])
+    if params.variant in RECURRENT:
+        memory, drive = lstm.Memory(hidden=states.hidden, cell=states.cell), _drive(params, inputs)
+        memories = lstm.scan(_recurrence(params), memory, drive, is_first[..., None])
+    velocity = _velocity(params, inputs, memories.hidden)
+    return State(hidden=memories.hidden[-1], cell=memories.cell[-1], velocity=velocity[-1]), velocity
 
 
 def save(path: Path | str, params: Params, metadata: JsonObject | None = None) -> None:
@@ -161,29 +186,62 @@ def load(path: Path | str) -> tuple[Params, JsonObject]:
     return _with_tensors(template, tensors), metadata
 
 
-def _views(params: Params, sides: Float[Array, "2"]) -> Float[Array, "views 2"]:
-    """Stack a (left, right) pair and, if symmetric, its mirror image."""
-    return jnp.stack([sides, sides[::-1]] if params.symmetric else [sides])
+def _run_stepwise(params: Params, states: State, u: Array, is_first: Array) -> tuple[State, Array]:
+    """Do as `run` where the input of a frame is the output of the one before."""
+    initial = init(params)
+
+    def frame(state: State, now: tuple[Array, Array]) -> tuple[State, Array]:
+        u, is_first = now
+        return step(params, jax.tree.map(partial(jnp.where, is_first), initial, state), u)
+
+    return jax.lax.scan(jax.vmap(frame), states, (u, is_first))
 
 
-def _forward(
-    params: Params, memory: tuple[Array, Array], u: Float[Array, "2"], last: Float[Array, "2"]
-) -> tuple[tuple[Array, Array], Float[Array, "2"]]:
-    """Return the next memory and the velocity for one view of the scene."""
-    if params.variant == "mean":
-        return memory, params.output_mean
-    inputs = (u - params.input_mean) / params.input_scale
+def _views(params: Params, sides: Float[Array, "*frames 2"]) -> Float[Array, "*frames views 2"]:
+    """Stack (left, right) pairs and, if symmetric, their mirror images."""
+    return jnp.stack([sides, sides[..., ::-1]] if params.symmetric else [sides], axis=-2)
+
+
+def _inputs(
+    params: Params, u: Float[Array, "*frames 2"], last: Float[Array, "*frames 2"]
+) -> Float[Array, "*frames views inputs"]:
+    """Return the standardised inputs of the network for each view of the scene."""
+    inputs = (_views(params, u) - params.input_mean) / params.input_scale
     if params.variant == "lstm-efference":
-        inputs = jnp.concatenate([inputs, (last - params.output_mean) / params.output_scale])
-    network = nnx.merge(_graph(params.variant, params.units), params.weights)
-    memory, output = network(memory, inputs)
-    return memory, params.output_mean + params.output_scale * output
+        last = (_views(params, last) - params.output_mean) / params.output_scale
+        inputs = jnp.concatenate([inputs, last], axis=-1)
+    return inputs
 
 
-@lru_cache
-def _graph(variant: Variant, units: int) -> nnx.GraphDef:
-    """Return the structure of the network without its weights."""
-    return nnx.split(nnx.eval_shape(lambda: _network(variant, units, nnx.Rngs(0))))[0]
+def _drive(params: Params, inputs: Float[Array, "*frames inputs"]) -> Float[Array, "*frames gates"]:
+    cell = params.weights["cell"]
+    return inputs @ cell["dense_i"]["kernel"] + cell["dense_h"]["bias"]
+
+
+def _recurrence(params: Params) -> Float[Array, "units gates"]:
+    return params.weights["cell"]["dense_h"]["kernel"]
+
+
+def _velocity(
+    params: Params, inputs: Float[Array, "*frames views inputs"], hidden: Float[Array, "*_ views units"]
+) -> Float[Array, "*frames 2"]:
+    """Return the output of the network in units of velocity, averaged over the views."""
+    if params.variant == "mean":
+        outputs = jnp.zeros((*inputs.shape[:-1], 2), inputs.dtype)
+    else:
+        outputs = _features(params, inputs, hidden) @ params.weights["head"]["kernel"] + params.weights["head"]["bias"]
+    views = params.output_mean + params.output_scale * outputs
+    # The second view, if there is one, is of the mirror image and is mirrored back.
+    return jnp.mean(views.at[..., 1:, :].set(views[..., 1:, ::-1]), axis=-2)
+
+
+def _features(
+    params: Params, inputs: Float[Array, "*frames views inputs"], hidden: Float[Array, "*_ views units"]
+) -> Float[Array, "*frames views units"]:
+    """Return the input of the last layer: the hidden state of the LSTM, or the units without memory."""
+    if params.variant == "feed-forward":
+        return jnp.tanh(inputs @ params.weights["layer"]["kernel"] + params.weights["layer"]["bias"])
+    return hidden
 
 
 def _network(variant: Variant, units: int, rngs: nnx.Rngs) -> nnx.Module:
@@ -197,7 +255,7 @@ def _sample_weights(key: Array, variant: Variant, units: int) -> dict[str, PyTre
         return {}
     weights = nnx.to_pure_dict(nnx.split(_network(variant, units, nnx.Rngs(key)))[1])
     weights = jax.tree.map(lambda weight: jnp.asarray(weight, dtype=float), weights)
-    if variant != "feed-forward":
+    if variant in RECURRENT:
         # The gates are input, forget, cell, output. With forget bias 1 the first gradients reach far back in time.
         bias = weights["cell"]["dense_h"]["bias"]
         weights["cell"]["dense_h"]["bias"] = bias.at[units : 2 * units].set(1)

@@ -44,6 +44,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.learning.checkpoints import Checkpoints, resumable
 from lgmdjax.learning.sequences import SequenceBatch, pack
 from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.simulation import sharding
 from lgmdjax.simulation.episodes import Walk
 
 TURN_GAIN = 1.5
@@ -196,22 +197,19 @@ def score_variants(navigators: Mapping[str, navigator.Params], walks: Mapping[st
 
 def window_loss(
     params: navigator.Params, weights: PyTree, states: navigator.State, batch: SequenceBatch, *, command_feedback: bool
-) -> tuple[Array, tuple[Array, navigator.State]]:
-    """Run the network over one window; return its MSE, and (sum of squared errors, states after the window)."""
-    params = replace(params, weights=weights)
-    initial = _init_states(params, batch)
+) -> tuple[Array, navigator.State]:
+    """Run the network over one window; return its MSE, and the states after the window."""
+    squares, states = window_squares(params, weights, states, batch, command_feedback=command_feedback)
+    return squares / (2 * jnp.maximum(jnp.sum(batch.mask), 1.0)), states
 
-    def frame(states: navigator.State, now: SequenceBatch) -> tuple[navigator.State, Array]:
-        if command_feedback:
-            states = replace(states, velocity=now.previous_velocity)
-        reset = jax.vmap(lambda is_first, *both: jax.tree.map(partial(jnp.where, is_first), *both))
-        states = reset(now.is_first, initial, states)
-        states, velocity = jax.vmap(navigator.step, in_axes=(None, 0, 0))(params, states, now.u)
-        return states, jnp.sum(now.mask[:, None] * (velocity - now.label) ** 2)
 
-    states, squares = jax.lax.scan(frame, states, batch)
-    total = jnp.sum(squares)
-    return total / (2 * jnp.maximum(jnp.sum(batch.mask), 1.0)), (total, states)
+def window_squares(
+    params: navigator.Params, weights: PyTree, states: navigator.State, batch: SequenceBatch, *, command_feedback: bool
+) -> tuple[Array, navigator.State]:
+    """Run the network over one window; return the sum of its squared errors, and the states after the window."""
+    executed = batch.previous_velocity if command_feedback else None
+    states, velocity = navigator.run(replace(params, weights=weights), states, batch.u, batch.is_first, executed)
+    return jnp.sum(batch.mask[..., None] * (velocity - batch.label) ** 2), states
 
 
 def _run_epochs(
@@ -226,7 +224,9 @@ def _run_epochs(
     """Run the remaining epochs, a hundredth of all epochs in one call, with a progress bar."""
 
     def advance(progress: Progress, epoch: int, end: int) -> Progress:
-        return _train_epochs(params, progress, data, end - epoch, settings)
+        progress = _train_epochs(params, progress, data, end - epoch, settings)
+        # Through the host, since the result lies on all devices, and checkpoints and callers want it on one.
+        return jax.tree.map(jnp.asarray, jax.device_get(progress))
 
     total = settings.epochs
     steps = resumable(advance, initial, checkpoints, total=total, chunk=max(1, total // 100), interval=SAVE_EVERY)
@@ -247,24 +247,32 @@ def _train_epochs(
     epochs: Int[Array, ""] | int,
     settings: Settings,
 ) -> Progress:
-    """Train for some epochs; their number is traced, so that one program serves all calls."""
-    return jax.lax.fori_loop(0, epochs, lambda _, p: _train_epoch(params, p, *data, settings), progress)
+    """Train for some epochs, with the streams over all devices; one program serves any number of epochs."""
+
+    def train(
+        data: tuple[SequenceBatch, SequenceBatch], params: navigator.Params, progress: Progress, epochs: Array
+    ) -> Progress:
+        return jax.lax.fori_loop(0, epochs, lambda _, p: _train_epoch(params, p, *data, settings), progress)
+
+    return sharding.shard_streams(train, data, (params, progress, jnp.asarray(epochs)), axis=2)
 
 
 def _train_epoch(
     params: navigator.Params, progress: Progress, train: SequenceBatch, test: SequenceBatch, settings: Settings
 ) -> Progress:
     optimiser = _optimiser(settings, len(train.u))
-    loss = partial(window_loss, params, command_feedback=settings.command_feedback)
+    loss = partial(window_squares, params, command_feedback=settings.command_feedback)
 
     def window(carry: tuple[PyTree, optax.OptState, navigator.State], batch: SequenceBatch):
         weights, memory, states = carry
-        (_, (squares, states)), gradient = jax.value_and_grad(loss, has_aux=True)(weights, states, batch)
+        (squares, states), gradient = jax.value_and_grad(loss, has_aux=True)(weights, states, batch)
+        squares, frames, gradient = sharding.sum_over_devices((squares, jnp.sum(batch.mask), gradient))
+        gradient = jax.tree.map(lambda g: g / (2 * jnp.maximum(frames, 1.0)), gradient)
         updates, memory = optimiser.update(gradient, memory)
-        return (optax.apply_updates(weights, updates), memory, states), squares
+        return (optax.apply_updates(weights, updates), memory, states), (squares, frames)
 
     carry = progress.weights, progress.optimiser, _init_states(params, train)
-    (weights, memory, _), squares = jax.lax.scan(window, carry, train)
+    (weights, memory, _), (squares, frames) = jax.lax.scan(window, carry, train)
     error = _batch_mse(replace(params, weights=weights), test)
     better = ~(error >= jnp.nanmin(progress.test))  # true for the first epoch too, when all are nan
     return Progress(
@@ -272,7 +280,7 @@ def _train_epoch(
         optimiser=memory,
         best=jax.tree.map(lambda new, old: jnp.where(better, new, old), weights, progress.best),
         epoch=progress.epoch + 1,
-        train=progress.train.at[progress.epoch].set(jnp.sum(squares) / (2 * jnp.sum(train.mask))),
+        train=progress.train.at[progress.epoch].set(jnp.sum(squares) / (2 * jnp.sum(frames))),
         test=progress.test.at[progress.epoch].set(error),
     )
 
@@ -281,11 +289,12 @@ def _batch_mse(params: navigator.Params, batch: SequenceBatch) -> Float[Array, "
     """Return the MSE over all windows of a batch."""
 
     def window(states: navigator.State, batch: SequenceBatch) -> tuple[navigator.State, Array]:
-        _, (squares, states) = window_loss(params, params.weights, states, batch, command_feedback=False)
+        squares, states = window_squares(params, params.weights, states, batch, command_feedback=False)
         return states, squares
 
     _, squares = jax.lax.scan(window, _init_states(params, batch), batch)
-    return jnp.sum(squares) / (2 * jnp.sum(batch.mask))
+    squares, frames = sharding.sum_over_devices((jnp.sum(squares), jnp.sum(batch.mask)))
+    return squares / (2 * frames)
 
 
 @jax.jit

@@ -176,10 +176,9 @@ def loss(
     """
     own = from_fit_params(params, {**to_fit_params(params), **fitted})
     u = respond(lgmd.with_smooth_thresholds(own.detector, width), batch.differences)
-    error, (_, states) = behaviour_cloning.window_loss(
+    return behaviour_cloning.window_loss(
         own.navigator, own.navigator.weights, states, replace(batch.sequences, u=u), command_feedback=False
     )
-    return error, states
 
 
 def init_states(params: navigator.Params, streams: int) -> navigator.State:

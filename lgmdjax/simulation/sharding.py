@@ -1,8 +1,9 @@
-"""Robots spread over the devices of this machine.
+"""Robots, and the streams of a fit, spread over the devices of this machine.
 
 Robots are independent of each other, so they can run in parallel. A CPU core is a device if `JAX_NUM_CPU_DEVICES` says
 so before JAX starts, as the command line does. The cores cannot share one robot, whose physics is a long sequence of
-small sums.
+small sums. Streams of recorded walks are independent too, except that all share the weights, whose gradient is summed
+over the devices.
 """
 
 from collections.abc import Callable
@@ -10,10 +11,14 @@ from typing import TypeVar
 
 import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
 ResultT = TypeVar("ResultT")
+TreeT = TypeVar("TreeT")
+
+MIN_STREAMS = 8  # on one device; fewer take no less time than these
 
 
 def shard_robots(work: Callable[..., ResultT], *batches: PyTree) -> ResultT:
@@ -25,7 +30,7 @@ def shard_robots(work: Callable[..., ResultT], *batches: PyTree) -> ResultT:
     """
     robots = jax.tree.leaves(batches)[0].shape[0]
     devices = device_count(robots)
-    mesh = Mesh(np.asarray(jax.local_devices()[:devices]), ("robots",))
+    mesh = _mesh(devices, "robots")
     spec = PartitionSpec("robots")
     # check_vma is off: robots exchange nothing, and MJX starts its loops with constants, which the check refuses.
     sharded = jax.shard_map(work, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
@@ -43,3 +48,36 @@ def device_count(robots: int) -> int:
     A batch of one would be compiled differently, with other rounding.
     """
     return max(min(jax.local_device_count(), robots // 2), 1)
+
+
+def shard_streams(work: Callable[..., ResultT], batches: PyTree, shared: tuple[PyTree, ...], *, axis: int) -> ResultT:
+    """Shard `work(batches, *shared)` over devices along the axis of streams; its result is the same on all of them.
+
+    Args:
+        work: sums with `sum_over_devices` whatever depends on its streams alone.
+        batches: leaves with an axis of streams.
+        shared: further arguments, whole on every device.
+        axis: of the streams in every leaf of `batches`.
+    """
+    streams = jax.tree.leaves(batches)[0].shape[axis]
+    mesh = _mesh(stream_device_count(streams), "streams")
+    spec = PartitionSpec(*(None,) * axis, "streams")
+    specs = (spec, *(PartitionSpec(),) * len(shared))
+    # check_vma is off: it would sum gradients over the devices by itself, leaf by leaf, which takes longer.
+    return jax.shard_map(work, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)(batches, *shared)
+
+
+def sum_over_devices(tree: TreeT) -> TreeT:
+    """Return the sum of a tree over the devices of `shard_streams`, in one exchange for all leaves."""
+    flat, unravel = ravel_pytree(tree)
+    return unravel(jax.lax.psum(flat, "streams"))
+
+
+def stream_device_count(streams: int) -> int:
+    """Return the number of devices for streams: the largest that gives each equally many, and enough of them."""
+    most = max(min(jax.local_device_count(), streams // MIN_STREAMS), 1)
+    return max(count for count in range(1, most + 1) if streams % count == 0)
+
+
+def _mesh(devices: int, axis: str) -> Mesh:
+    return Mesh(np.asarray(jax.local_devices()[:devices]), (axis,))

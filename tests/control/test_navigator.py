@@ -94,6 +94,38 @@ def test_a_symmetric_navigator_mirrors_its_velocity_for_mirrored_inputs(variant,
     np.testing.assert_allclose(run(both, u), expected, rtol=1e-12 if precision == "float64" else 1e-5)
 
 
+@pytest.mark.parametrize("symmetric", [False, True])
+@pytest.mark.parametrize(
+    ("variant", "fed_back"), [*((variant, False) for variant in names.VARIANTS), ("lstm-efference", True)]
+)
+def test_a_run_equals_single_steps(variant, fed_back, symmetric):
+    """Three streams that begin again at other frames, after eight frames of walking."""
+    params, rng = scaled(variant, symmetric=symmetric), np.random.default_rng(1)
+    u, executed = (jnp.asarray(rng.uniform(0.5, 1, (16, 3, 2))) for _ in range(2))
+    is_first = jnp.asarray(rng.uniform(size=(16, 3)) < 0.2)
+    initial = navigator.init(params)
+
+    @jax.jit
+    @jax.vmap
+    def frame(state, u, is_first, executed):
+        state = replace(state, velocity=executed) if fed_back else state
+        state = jax.tree.map(lambda a, b: jnp.where(is_first, a, b), initial, state)
+        return navigator.step(params, state, u)
+
+    states, after = (jax.tree.map(lambda x: jnp.stack([x] * 3), initial),) * 2
+    expected, run_velocities = [], []
+    for k in range(16):
+        states, velocity = frame(states, u[k], is_first[k], executed[k])
+        expected.append(velocity)
+    run_half = jax.jit(navigator.run)
+    for half in (slice(0, 8), slice(8, 16)):
+        after, velocity = run_half(params, after, u[half], is_first[half], executed[half] if fed_back else None)
+        run_velocities.extend(velocity)
+    np.testing.assert_allclose(run_velocities, expected, rtol=1e-12)
+    for got, wanted in zip(jax.tree.leaves(after), jax.tree.leaves(states), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-12)
+
+
 def test_variant_mean_returns_the_mean():
     params = scaled("mean")
     np.testing.assert_array_equal(run(params, jnp.asarray(U)), np.tile(params.output_mean, (40, 1)))

@@ -12,6 +12,7 @@ from lgmdjax.control import names, navigator
 from lgmdjax.errors import InputError
 from lgmdjax.learning import behaviour_cloning, sequences
 from lgmdjax.learning.checkpoints import Checkpoints
+from lgmdjax.simulation import sharding
 from lgmdjax.simulation.episodes import Walk
 
 EPOCHS = 20  # the same in most tests, so that they share one compiled program
@@ -174,6 +175,23 @@ def test_the_best_is_kept_when_the_test_error_rises(data):
     fit = behaviour_cloning.fit(navigator.create(jax.random.key(0)), train, turned, settings(), show_progress=False)
     assert fit.test_mse.argmin() < EPOCHS - 1 and not same(fit.best, fit.params)
     assert behaviour_cloning.score(fit.best, turned)["mse"] < behaviour_cloning.score(fit.params, turned)["mse"]
+
+
+def test_another_number_of_devices_gives_the_same_to_rounding(data, monkeypatch):
+    train, test, _ = data
+    fits = []
+    for least, devices in ((8, min(2, jax.local_device_count())), (1000, 1)):
+        monkeypatch.setattr(sharding, "MIN_STREAMS", least)
+        assert sharding.stream_device_count(16) == devices
+        jax.clear_caches()  # of the program compiled for the other number
+        fits.append(
+            behaviour_cloning.fit(
+                navigator.create(jax.random.key(0)), train, test, settings(epochs=2), show_progress=False
+            )
+        )
+    jax.clear_caches()
+    for one, other in zip(jax.tree.leaves(vars(fits[0])), jax.tree.leaves(vars(fits[1])), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_an_interrupted_fit_gives_the_same_result(data, tmp_path, monkeypatch):
