@@ -55,9 +55,9 @@ _PAPER = CameraSettings(width=320, height=240, pooling=12, **_FIELD)
 SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
     "smoke": {
         "fit-gait": FitGaitSettings(steps=300, seconds=6),
-        "collect": CollectSettings(eyes=_SMALL, robots=4, episodes=2, seconds=10, calibration_seconds=5),
+        "collect": CollectSettings(eyes=_QUICK, robots=4, episodes=2, seconds=10, calibration_seconds=5),
         "train": TrainSettings(
-            eyes=_SMALL,
+            eyes=_QUICK,
             epochs=5,
             dagger_rounds=1,
             round_epochs=5,
@@ -68,8 +68,8 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
         ),
         "evaluate": EvaluateSettings(
             trials=(
-                TrialPlan(trial="testing", eyes=_SMALL, seeds=4, seconds=5),
-                TrialPlan(trial="unseen", eyes=_SMALL, seeds=4, seconds=5),
+                TrialPlan(trial="testing", eyes=_QUICK, seeds=4, seconds=5),
+                TrialPlan(trial="unseen", eyes=_QUICK, seeds=4, seconds=5),
             )
         ),
         "report": ReportSettings(video_seconds=1),

@@ -79,7 +79,7 @@ def test_the_controllers_header_has_its_detector_and_camera(run):
     calibration = json.loads((run / "collect" / "calibration.json").read_text())
     assert params.variant == "lstm"
     assert header["lgmd"]["threshold"] == calibration["threshold"]
-    assert header["eyes"]["width"] == 64
+    assert header["eyes"]["width"] == 80
     assert not shaping.load(run / "fit-gait" / "shaping.safetensors").printed_input
 
 
