@@ -179,14 +179,22 @@ def pool(params: Params, frame: Float[Array, "height width"]) -> Float[Array, "r
     """
     if params.pooling == 1:
         return frame
-    rows, columns = (jnp.asarray(_pooling_weights(size, params.pooling), frame.dtype) for size in frame.shape)
+    height, width = frame.shape
+    rows, columns = _cell_count(height, params.pooling), _cell_count(width, params.pooling)
     matmul = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
-    return matmul(matmul(rows, frame), columns.T)
+    if height % rows == 0:  # a sum of whole rows, a quarter of the product's time
+        pooled = jnp.mean(frame.reshape(rows, height // rows, width), axis=1)
+    else:
+        pooled = matmul(jnp.asarray(_pooling_weights(height, rows), frame.dtype), frame)
+    return matmul(pooled, jnp.asarray(_pooling_weights(width, columns), frame.dtype).T)
 
 
-def _pooling_weights(pixels: int, pooling: int) -> Float[np.ndarray, "cells pixels"]:
+def _cell_count(pixels: int, pooling: int) -> int:
+    return max(round(pixels / pooling), 1)
+
+
+def _pooling_weights(pixels: int, cells: int) -> Float[np.ndarray, "cells pixels"]:
     """Return the weight of each pixel in each cell, along one side of the frame."""
-    cells = max(round(pixels / pooling), 1)
     edges = np.arange(cells + 1) * pixels / cells
     pixel = np.arange(pixels)
     common = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
