@@ -1,12 +1,14 @@
 """The contract of every component: a state of fixed structure, one compilation, equal results in every mode, gradients.
 
 A component has `Params`, `State`, `init` and `step(params, state, input) -> (state, output)`. Add new
-ones to `COMPONENTS`. Each is tested in double and single precision, with implicit dtype promotion forbidden.
+ones to `COMPONENTS`. Each is tested in double and single precision, with implicit dtype promotion forbidden; detectors
+in single precision alone, since their transcriptions in NumPy are compared in double precision.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ import pytest
 from jaxtyping import Array, PyTree
 
 from lgmdjax.control import braitenberg, controller, names, navigator, policies
-from lgmdjax.detectors import lgmd
+from lgmdjax.detectors import lgmd, lgmd1_grouping
 from lgmdjax.locomotion import cpg, shaping
 
 STEPS = 4
@@ -34,6 +36,7 @@ class Component:
         inputs: returns `STEPS` inputs, stacked, from a random generator.
         zero_gradient: names of parameters whose gradient is zero here; a comment says why.
         eager: whether to run it without jit too, which takes minutes for a composition of other components.
+        precisions: in which it is tested.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Component:
     inputs: Callable[[np.random.Generator], PyTree]
     zero_gradient: tuple[str, ...] = ()
     eager: bool = True
+    precisions: tuple[str, ...] = ("float64", "float32")
 
 
 def noise(*shape: int) -> Callable[[np.random.Generator], Array]:
@@ -92,6 +96,19 @@ def policy_component(
     )
 
 
+def detector(module: Any, params: Callable[[], PyTree], zero_gradient: tuple[str, ...] = ()) -> Component:
+    return Component(
+        module.__name__.rpartition(".")[2],
+        params,
+        module.init,
+        module.step,
+        noise(12, 16),
+        zero_gradient,
+        eager=False,
+        precisions=("float32",),
+    )
+
+
 # `closed_loop` follows the contract too, but is not here, since MuJoCo's step takes long to compile. Where it is
 # compiled anyway, test_closed_loop checks that its state can be scanned and that chunks of a batch equal the rollout of
 # one robot, and test_rollout_gradient checks that both modes agree in every parameter of the controller.
@@ -105,6 +122,7 @@ COMPONENTS = (
         noise(12, 16),
         zero_gradient=("threshold", "suppression", "threshold_width", "suppression_width"),  # steps
     ),
+    detector(lgmd1_grouping, lambda: lgmd1_grouping.Params(threshold=1.0, smooth=True)),
     Component(
         "cpg",
         lambda: cpg.Params(substeps=2),
@@ -167,8 +185,16 @@ COMPONENTS = (
         eager=False,
     ),
 )
-each = pytest.mark.parametrize("component", COMPONENTS, ids=lambda component: component.name)
-pytestmark = pytest.mark.usefixtures("precision", "strict")
+each = pytest.mark.parametrize(
+    ("precision", "component"),
+    [
+        pytest.param(precision, component, id=f"{precision}-{component.name}")
+        for component in COMPONENTS
+        for precision in component.precisions
+    ],
+    indirect=["precision"],
+)
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def build(component: Component) -> tuple[PyTree, PyTree, PyTree]:
@@ -204,7 +230,7 @@ def signature(tree: PyTree) -> tuple[object, list]:
 
 
 @each
-def test_state_keeps_structure_shapes_and_dtypes(component):
+def test_state_keeps_structure_shapes_and_dtypes(precision, component):
     params, state, inputs = build(component)
     next_state, output = jax.eval_shape(component.step, params, state, at(inputs, 0))
     assert signature(next_state) == signature(jax.eval_shape(lambda: state))
@@ -214,7 +240,7 @@ def test_state_keeps_structure_shapes_and_dtypes(component):
 
 
 @each
-def test_jit_scan_and_vmap_equal_eager_steps_and_compile_once(component):
+def test_jit_scan_and_vmap_equal_eager_steps_and_compile_once(precision, component):
     params, state, inputs = build(component)
     traced = []
 
@@ -237,7 +263,7 @@ def test_jit_scan_and_vmap_equal_eager_steps_and_compile_once(component):
 
 
 @each
-def test_gradient_is_finite_and_reaches_every_parameter(component):
+def test_gradient_is_finite_and_reaches_every_parameter(precision, component):
     params, _, inputs = build(component)
 
     @jax.jit

@@ -43,7 +43,6 @@ With `smooth` both steps are sigmoids of a width in grey levels, which tend to t
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -52,10 +51,11 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgmdjax.detectors import cells
 from lgmdjax.errors import InputError
 
 KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
-U_AT_REST = 0.5  # u without motion
+U_AT_REST = cells.U_AT_REST
 
 # w_I (eq. 9)
 KERNEL = (
@@ -115,7 +115,7 @@ class Layers:
 
 def init(params: Params, frame: Float[Array, "height width"]) -> State:
     """Return the state after a first frame, before any change."""
-    _require_frame(frame)
+    cells.require_frame("lgmd", frame)
     pooled = pool(params, frame)
     return State(frame=pooled, difference=jnp.zeros_like(pooled))
 
@@ -138,18 +138,18 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
         state: from the last frame.
         frame: grey levels 0..255.
     """
-    cells = layers(params, state, frame)
-    U = _mean_excitation(params, cells.summation)
+    now = layers(params, state, frame)
+    U = _mean_excitation(params, now.summation)
     FF = _feed_forward(params, state.difference)
     u = U_AT_REST + _gate(params, FF) * (jax.nn.sigmoid(U) - U_AT_REST)
-    return State(frame=pool(params, frame), difference=cells.difference), Response(u=u, feed_forward=FF, excitation=U)
+    return State(frame=pool(params, frame), difference=now.difference), Response(u=u, feed_forward=FF, excitation=U)
 
 
 def layers(params: Params, state: State, frame: Float[Array, "height width"]) -> Layers:
     """Return the layers of cells for the next frame (eqs. 7-11)."""
-    _require_frame(frame)
+    cells.require_frame("lgmd", frame)
     pooled = pool(params, frame)
-    _require_size(pooled.shape, state.frame.shape)
+    cells.require_size("lgmd", pooled, state.frame)
     P = pooled - state.frame
     E = jnp.abs(P)
     I = inhibit(params.kernel, state.difference)  # noqa: E741
@@ -157,28 +157,12 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
 
 
 def pool(params: Params, frame: Float[Array, "height width"]) -> Float[Array, "rows columns"]:
-    """Average a frame over the square of each cell.
-
-    The number of cells is the one that comes nearest to `pooling` pixels a side. The cells divide the frame evenly,
-    pixels on a border belong to two cells in part, and mirrored frames give mirrored cells.
+    """Average a frame over the square of each cell (`lgmdjax.detectors.cells.pool`).
 
     >>> pool(Params(pooling=2), jnp.arange(8.0).reshape(2, 4)).tolist()
     [[2.5, 4.5]]
     """
-    if params.pooling == 1:
-        return frame
-    rows, columns = (jnp.asarray(_pooling_weights(size, params.pooling), frame.dtype) for size in frame.shape)
-    matmul = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
-    return matmul(matmul(rows, frame), columns.T)
-
-
-def _pooling_weights(pixels: int, pooling: int) -> Float[np.ndarray, "cells pixels"]:
-    """Return the weight of each pixel in each cell, along one side of the frame."""
-    cells = max(round(pixels / pooling), 1)
-    edges = np.arange(cells + 1) * pixels / cells
-    pixel = np.arange(pixels)
-    common = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
-    return np.clip(common, 0.0, None) * cells / pixels
+    return cells.pool(frame, params.pooling)
 
 
 def inhibit(kernel: Float[Array, "5 5"], difference: Float[Array, "height width"]) -> Float[Array, "height width"]:
@@ -243,7 +227,7 @@ def _mean_excitation(params: Params, summation: Float[Array, "height width"]) ->
     S, margin = summation, summation - params.threshold
     sigmoid = params.smooth
     passed = S * jax.nn.sigmoid(margin / params.threshold_width) if sigmoid else jnp.where(margin >= 0, S, 0.0)
-    return _mean(jnp.abs(passed))
+    return cells.mean(jnp.abs(passed))
 
 
 def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
@@ -254,7 +238,7 @@ def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
 
 def _feed_forward(params: Params, difference: Float[Array, "height width"]) -> Float[Array, ""]:
     """Return FF, the mean magnitude of the last change (eq. 15), or the mean of the change itself as printed."""
-    return _mean(difference if params.printed_feed_forward else jnp.abs(difference))
+    return cells.mean(difference if params.printed_feed_forward else jnp.abs(difference))
 
 
 def _gate(params: Params, FF: Float[Array, ""]) -> Float[Array, ""]:
@@ -264,25 +248,3 @@ def _gate(params: Params, FF: Float[Array, ""]) -> Float[Array, ""]:
         return jax.nn.sigmoid((excess if params.printed_gate else -excess) / params.suppression_width)
     is_high = excess > 0
     return jnp.where(is_high if params.printed_gate else ~is_high, jnp.ones_like(FF), jnp.zeros_like(FF))
-
-
-def _mean(cells: Float[Array, "height width"]) -> Float[Array, ""]:
-    """Return the mean over all cells, with rows summed by a product with ones: XLA's sum on a CPU is not vectorised."""
-    ones = jnp.ones(cells.shape[1], cells.dtype)
-    return jnp.sum(jnp.matmul(cells, ones, precision=lax.Precision.HIGHEST)) / cells.size
-
-
-def _require_frame(frame: Array) -> None:
-    if jnp.ndim(frame) != 2 or not jnp.issubdtype(frame.dtype, jnp.floating):
-        raise InputError(
-            f"lgmd: expected a frame of floats, grey 0..255, shape (height, width), got {frame.dtype} {frame.shape}; "
-            "use frame.astype(float), and vmap for several eyes"
-        )
-
-
-def _require_size(shape: tuple[int, ...], before: tuple[int, ...]) -> None:
-    if shape != before:
-        raise InputError(
-            f"lgmd: expected a frame of {before[1]} x {before[0]} cells as before, got {shape[1]} x {shape[0]}; "
-            "keep one resolution, or init again"
-        )
