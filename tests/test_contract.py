@@ -17,7 +17,7 @@ import pytest
 from jaxtyping import Array, PyTree
 
 from lgmdjax.control import braitenberg, controller, names, navigator, policies
-from lgmdjax.detectors import lgmd, lgmd1_grouping
+from lgmdjax.detectors import lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2
 from lgmdjax.locomotion import cpg, shaping
 
 STEPS = 4
@@ -123,6 +123,17 @@ COMPONENTS = (
         zero_gradient=("threshold", "suppression", "threshold_width", "suppression_width"),  # steps
     ),
     detector(lgmd1_grouping, lambda: lgmd1_grouping.Params(threshold=1.0, smooth=True)),
+    detector(
+        lgmd1_onoff,
+        lambda: lgmd1_onoff.Params(threshold=5.0, smooth=True),
+        zero_gradient=("adaptation_threshold",),  # a step
+    ),
+    detector(
+        lgmd2,
+        # Inhibition of which half, as mediated, is above its lowest value, and weak enough for the ON channel to pass.
+        lambda: lgmd2.Params(threshold=1.0, mediation_scale=15.0, on_inhibition=0.2, off_inhibition=0.3, smooth=True),
+        zero_gradient=("adaptation_threshold", "joint_weight"),  # a step; in noise no cell passes both channels
+    ),
     Component(
         "cpg",
         lambda: cpg.Params(substeps=2),

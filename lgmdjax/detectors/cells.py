@@ -1,12 +1,12 @@
 """Operations that layers of cells share: pooling, neighbourhoods, thresholds, filters, grouping, checks of a frame.
 
-| symbol    | name                 | unit | meaning                                                       |
-| --------- | -------------------- | ---- | ------------------------------------------------------------- |
-| dt        | frame_time           | s    | time from one frame to the next                               |
-| tau       | time_constant        | s    | of a filter of the first order                                |
-| S         | summation            | grey | cells that are grouped                                        |
-| Ce        | -                    | grey | mean of the 3 x 3 cells around each: its passing coefficient  |
-| w, C_w, D | -, share, offset     | grey | w = D + max |Ce| / C_w, the scale of Ce                       |
+| symbol    | name             | unit | meaning                                                      |
+| --------- | ---------------- | ---- | ------------------------------------------------------------ |
+| dt        | frame_time       | s    | time from one frame to the next                              |
+| tau       | time_constant    | s    | of a filter of the first order                               |
+| S         | summation        | grey | cells that are grouped                                       |
+| Ce        | -                | grey | mean of the 3 x 3 cells around each: its passing coefficient |
+| w, C_w, D | -, share, offset | grey | w = D + max |Ce| / C_w, the scale of Ce                      |
 
 The 3 x 3 kernels of the detectors depend on the distance alone, so a neighbourhood is two sums: over the four nearest
 cells and over the four diagonal ones. Such weights keep mirror symmetry whatever is learned.

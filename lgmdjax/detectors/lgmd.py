@@ -5,20 +5,20 @@ frame later, by the changes around it. Edges that spread faster than the inhibit
 approaching object. Whole-field motion, such as a fast turn, is recognised by its total change and suppresses the
 response.
 
-| symbol    | name                        | unit        | equation |
-| --------- | --------------------------- | ----------- | -------- |
-| L_f       | frame                       | grey 0..255 | 7        |
-| P_f       | difference                  | grey        | 7        |
-| I_f       | layers.inhibition           | grey        | 8        |
-| w_I       | kernel                      | 1           | 9        |
-| E_f       | layers.excitation           | grey        | 10       |
-| S_f       | layers.summation            | grey        | 11       |
-| W_I       | inhibition                  | 1           | 11       |
-| T_s       | threshold                   | grey        | 12       |
-| U_f/n     | response.excitation         | grey        | 13, 14   |
-| u_f       | response.u                  | 1, 0.5..1   | 14, 16   |
-| FF        | response.feed_forward       | grey        | 15       |
-| T_f       | suppression                 | grey        | 16       |
+| symbol | name                  | unit        | equation |
+| ------ | --------------------- | ----------- | -------- |
+| L_f    | frame                 | grey 0..255 | 7        |
+| P_f    | difference            | grey        | 7        |
+| I_f    | layers.inhibition     | grey        | 8        |
+| w_I    | kernel                | 1           | 9        |
+| E_f    | layers.excitation     | grey        | 10       |
+| S_f    | layers.summation      | grey        | 11       |
+| W_I    | inhibition            | 1           | 11       |
+| T_s    | threshold             | grey        | 12       |
+| U_f/n  | response.excitation   | grey        | 13, 14   |
+| u_f    | response.u            | 1, 0.5..1   | 14, 16   |
+| FF     | response.feed_forward | grey        | 15       |
+| T_f    | suppression           | grey        | 16       |
 
 Source: Cizek & Faigl, sec. 3.3; Blanchard, Rind & Verschure 2000. Two equations contradict the text as printed and are
 corrected: eq. 15 averages the signed change, which is zero for a moving edge (`printed_feed_forward`), and eq. 16 keeps

@@ -5,24 +5,24 @@ inhibited by the last change around it. What is left is multiplied by its mean o
 raised above a threshold and isolated noise decays. Feed-forward inhibition suppresses the response to a change of the
 whole image.
 
-| symbol       | name                             | unit     | equation                                                |
-| ------------ | -------------------------------- | -------- | ------------------------------------------------------- |
-| L_f          | frame                            | grey     | -                                                       |
-| p_1          | persistence                      | 1        | -                                                       |
-| P_f = E_f    | layers.excitation                | grey     | P_f = L_f - L_{f-1} + p_1 P_{f-1}                       |
-| w_n, w_d     | nearest, diagonal                | 1        | 0.25, 0.125; 0 for the cell itself                      |
-| I_f          | layers.inhibition                | grey     | sum of w P_{f-1} over the eight neighbours              |
-| W_I          | inhibition                       | 1        | -                                                       |
-| S_f          | layers.summation                 | grey     | E_f - W_I I_f                                           |
-| Ce_f         | -                                | grey     | mean of S_f over 3 x 3 cells                            |
-| w            | -                                | grey     | D_c + max |Ce_f| / C_w                                  |
-| D_c, C_w     | group_offset, group_share        | grey, 1  | -                                                       |
-| G_f          | layers.grouping                  | grey     | S_f Ce_f / w; 0 where C_de G_f < T_de                   |
-| C_de, T_de   | decay, threshold                 | 1, grey  | -                                                       |
-| K_f / n_cell | response.excitation              | grey     | mean of |G_f|                                           |
-| F_f          | response.feed_forward            | grey     | mean of |P_{f-1}|                                       |
-| T_FFI        | suppression                      | grey     | u is 0.5 where F_f >= T_FFI                             |
-| u            | response.u                       | 0.5..1   | 1 / (1 + exp(-K_f / n_cell))                            |
+| symbol       | name                      | unit    | equation                                   |
+| ------------ | ------------------------- | ------- | ------------------------------------------ |
+| L_f          | frame                     | grey    | -                                          |
+| p_1          | persistence               | 1       | -                                          |
+| P_f = E_f    | layers.excitation         | grey    | P_f = L_f - L_{f-1} + p_1 P_{f-1}          |
+| w_n, w_d     | nearest, diagonal         | 1       | 0.25, 0.125; 0 for the cell itself         |
+| I_f          | layers.inhibition         | grey    | sum of w P_{f-1} over the eight neighbours |
+| W_I          | inhibition                | 1       | -                                          |
+| S_f          | layers.summation          | grey    | E_f - W_I I_f                              |
+| Ce_f         | -                         | grey    | mean of S_f over 3 x 3 cells               |
+| w            | -                         | grey    | D_c + max |Ce_f| / C_w                     |
+| D_c, C_w     | group_offset, group_share | grey, 1 | -                                          |
+| G_f          | layers.grouping           | grey    | S_f Ce_f / w; 0 where C_de G_f < T_de      |
+| C_de, T_de   | decay, threshold          | 1, grey | -                                          |
+| K_f / n_cell | response.excitation       | grey    | mean of |G_f|                              |
+| F_f          | response.feed_forward     | grey    | mean of |P_{f-1}|                          |
+| T_FFI        | suppression               | grey    | u is 0.5 where F_f >= T_FFI                |
+| u            | response.u                | 0.5..1  | 1 / (1 + exp(-K_f / n_cell))               |
 
 Source: Yue & Rind, "Collision detection in complex dynamic scenes using an LGMD-based visual neural network with
 feature enhancement", IEEE Trans. Neural Networks 17(3), 2006. Constants are those of public programs: W_I, w_n, w_d and
@@ -31,17 +31,17 @@ has the same ones. There, a spike is u >= 0.78 and a collision five spikes in a 
 
 Errata, and where the sources differ:
 
-| point               | paper                       | public programs                       | here                       |
-| ------------------- | --------------------------- | ------------------------------------- | -------------------------- |
-| persistence         | n_p earlier changes         | none                                  | one change, by default 0   |
-| signs of E and I    | signed: S Ce > 0 where      | |E| - W_I |I|, or only S >= T_s > 0,  | signed; `magnitudes` for   |
-|                     | neighbours agree            | by which darkening never passes       | |E| - W_I |I|              |
-| magnitudes          | -                           | S < 0 and Ce < 0 pass, as their       | the same                   |
-|                     |                             | product is positive                   |                            |
-| T_FFI, spike limit  | adapt over many frames      | constant                              | constant                   |
-| scale of Ce         | its maximum in the frame: a | the same                              | the same                   |
-|                     | frame of noise alone passes |                                       |                            |
-| cells on the border | -                           | the last row or column is repeated    | the same                   |
+| point               | paper                       | public programs                      | here                     |
+| ------------------- | --------------------------- | ------------------------------------ | ------------------------ |
+| persistence         | n_p earlier changes         | none                                 | one change, by default 0 |
+| signs of E and I    | signed: S Ce > 0 where      | |E| - W_I |I|, or only S >= T_s > 0, | signed; `magnitudes` for |
+|                     | neighbours agree            | by which darkening never passes      | |E| - W_I |I|            |
+| magnitudes          | -                           | S < 0 and Ce < 0 pass, as their      | the same                 |
+|                     |                             | product is positive                  |                          |
+| T_FFI, spike limit  | adapt over many frames      | constant                             | constant                 |
+| scale of Ce         | its maximum in the frame: a | the same                             | the same                 |
+|                     | frame of noise alone passes |                                      |                          |
+| cells on the border | -                           | the last row or column is repeated   | the same                 |
 
 Gradient: the thresholds are steps, so the gradients of T_de and T_FFI are zero, that of C_de too, and the others are
 exact almost everywhere. With `smooth` both steps are sigmoids.
@@ -128,7 +128,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
     >>> params = Params()
     >>> state = init(params, jnp.zeros((6, 8)))
     >>> state, response = step(params, state, jnp.full((6, 8), 50.0))
-    >>> float(response.excitation.round(1))  # S Ce / w of a change of 50 everywhere
+    >>> round(float(response.excitation), 1)  # S Ce / w of a change of 50 everywhere
     199.8
 
     Args:
