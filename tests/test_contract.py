@@ -6,7 +6,7 @@ in single precision alone, since their transcriptions in NumPy are compared in d
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,8 @@ import pytest
 from jaxtyping import Array, PyTree
 
 from lgmdjax.control import braitenberg, controller, names, navigator, policies
-from lgmdjax.detectors import lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2
+from lgmdjax.detectors import d_lgmd, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, tau
+from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.locomotion import cpg, shaping
 
 STEPS = 4
@@ -83,6 +84,14 @@ def observations(_: np.random.Generator) -> policies.Observation:
     return policies.Observation(u=u, feed_forward=zero, excitation=zero, distances=zero, corridor=zero)
 
 
+EMD_GAIN = (".motion.gain",)  # of the correlators as a detector of their own
+
+
+def looming_object(_: np.random.Generator) -> Geometry:
+    """Size and expansion of an object, as an observer would be told them."""
+    return Geometry(size=jnp.asarray([0.2, 0.25, 0.4, 1.0]), rate=jnp.asarray([0.5, 1.0, 2.0, 5.0]))
+
+
 def policy_component(
     policy: policies.Policy, params: Callable[[], PyTree], zero_gradient: tuple[str, ...] = ()
 ) -> Component:
@@ -134,6 +143,16 @@ COMPONENTS = (
         lambda: lgmd2.Params(threshold=1.0, mediation_scale=15.0, on_inhibition=0.2, off_inhibition=0.3, smooth=True),
         zero_gradient=("adaptation_threshold", "joint_weight"),  # a step; in noise no cell passes both channels
     ),
+    detector(
+        d_lgmd,
+        lambda: d_lgmd.Params(inhibition=0.2, threshold=0.2, interpolated=True, smooth=True),
+        zero_gradient=("max_threshold",),  # does not apply
+    ),
+    detector(emd, emd.Params),
+    detector(grm, grm.Params, EMD_GAIN),
+    detector(lplc2, lambda: replace(lplc2.create(5), intercept=0.3, inhibition_intercept=-0.01), EMD_GAIN),
+    replace(detector(eta, eta.Params), inputs=looming_object),
+    replace(detector(tau, tau.Params), inputs=looming_object),
     Component(
         "cpg",
         lambda: cpg.Params(substeps=2),
