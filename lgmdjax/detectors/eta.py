@@ -16,8 +16,9 @@ time after the object has reached theta_t, for all l/|v|.
 
 Source: Gabbiani, Krapp & Laurent, "Computation of object approach by a wide-field, motion-sensitive neuron", J.
 Neurosci. 19, 1999; Hatsopoulos, Gabbiani & Laurent 1995 for the function. theta_t = 24 degrees, thus alpha = 4.7, and
-delta = 27 ms are their means over neurons; the firing rate is C eta, and C differs from animal to animal. gain = 10 s
-is chosen here. Delays between two frames are interpolated, and `check` refuses those of more than HISTORY frames.
+delta = 27 ms are the means over neurons that are usually cited; the firing rate is C eta, and C differs from animal to
+animal. gain = 10 s is chosen here. Delays between two frames are interpolated, and `check` refuses those of more than
+HISTORY frames.
 
 Gradient: exact almost everywhere; zero for an object that recedes.
 """

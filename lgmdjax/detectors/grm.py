@@ -14,8 +14,8 @@ from front to back, and is not seen.
 | u      | response.u          | 0.5..1 | 1 / (1 + exp(-gain E))                            |
 
 Source: Chalupka, Dickinson & Perona, "Generalized regressive motion: a visual cue to collision", Bioinspiration &
-Biomimetics 11, 2016, after Zabala et al. 2012, for the cue and the two hemifields. Their agents know the geometry; that
-the motion comes from correlators, is rectified cell by cell and averaged is chosen here, and so is gain = 1000, as in
+Biomimetics 11, 2016, after Zabala et al. 2012, for the cue; of both, the abstracts were at hand. That the motion comes
+from correlators, is rectified cell by cell and averaged over a hemifield is chosen here, and so is gain = 1000, as in
 emd. The middle column of detectors belongs to neither half.
 
 Gradient: exact almost everywhere.

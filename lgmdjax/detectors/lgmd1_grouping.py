@@ -29,7 +29,7 @@ feature enhancement", IEEE Trans. Neural Networks 17(3), 2006. Constants are tho
 T_FFI of fuqinbing/LGMD-Plus-and-GAs-Open-Source; D_c, C_w, C_de and T_de of fuqinbing/LGMD2-open-source; Gary2017/LGMD
 has the same ones. There, a spike is u >= 0.78 and a collision five spikes in a row, which is left to whoever reads u.
 
-Errata, and where the sources differ:
+Errata, and where the sources differ. The paper was not at hand: its column is as later work describes it.
 
 | point               | paper                       | public programs                      | here                     |
 | ------------------- | --------------------------- | ------------------------------------ | ------------------------ |
