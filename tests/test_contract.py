@@ -1,12 +1,14 @@
 """The contract of every component: a state of fixed structure, one compilation, equal results in every mode, gradients.
 
 A component has `Params`, `State`, `init` and `step(params, state, input) -> (state, output)`. Add new
-ones to `COMPONENTS`. Each is tested in double and single precision, with implicit dtype promotion forbidden.
+ones to `COMPONENTS`. Each is tested in double and single precision, with implicit dtype promotion forbidden; detectors
+in single precision alone, since their transcriptions in NumPy are compared in double precision.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,8 @@ import pytest
 from jaxtyping import Array, PyTree
 
 from lgmdjax.control import braitenberg, controller, names, navigator, policies
-from lgmdjax.detectors import lgmd
+from lgmdjax.detectors import d_lgmd, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, tau
+from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.locomotion import cpg, shaping
 
 STEPS = 4
@@ -34,6 +37,7 @@ class Component:
         inputs: returns `STEPS` inputs, stacked, from a random generator.
         zero_gradient: names of parameters whose gradient is zero here; a comment says why.
         eager: whether to run it without jit too, which takes minutes for a composition of other components.
+        precisions: in which it is tested.
     """
 
     name: str
@@ -43,6 +47,7 @@ class Component:
     inputs: Callable[[np.random.Generator], PyTree]
     zero_gradient: tuple[str, ...] = ()
     eager: bool = True
+    precisions: tuple[str, ...] = ("float64", "float32")
 
 
 def noise(*shape: int) -> Callable[[np.random.Generator], Array]:
@@ -79,6 +84,14 @@ def observations(_: np.random.Generator) -> policies.Observation:
     return policies.Observation(u=u, feed_forward=zero, excitation=zero, distances=zero, corridor=zero)
 
 
+EMD_GAIN = (".motion.gain",)  # of the correlators as a detector of their own
+
+
+def looming_object(_: np.random.Generator) -> Geometry:
+    """Size and expansion of an object, as an observer would be told them."""
+    return Geometry(size=jnp.asarray([0.2, 0.25, 0.4, 1.0]), rate=jnp.asarray([0.5, 1.0, 2.0, 5.0]))
+
+
 def policy_component(
     policy: policies.Policy, params: Callable[[], PyTree], zero_gradient: tuple[str, ...] = ()
 ) -> Component:
@@ -89,6 +102,19 @@ def policy_component(
         policy.step,
         observations,
         zero_gradient,
+    )
+
+
+def detector(module: Any, params: Callable[[], PyTree], zero_gradient: tuple[str, ...] = ()) -> Component:
+    return Component(
+        module.__name__.rpartition(".")[2],
+        params,
+        module.init,
+        module.step,
+        noise(12, 16),
+        zero_gradient,
+        eager=False,
+        precisions=("float32",),
     )
 
 
@@ -105,6 +131,28 @@ COMPONENTS = (
         noise(12, 16),
         zero_gradient=("threshold", "suppression", "threshold_width", "suppression_width"),  # steps
     ),
+    detector(lgmd1_grouping, lambda: lgmd1_grouping.Params(threshold=1.0, smooth=True)),
+    detector(
+        lgmd1_onoff,
+        lambda: lgmd1_onoff.Params(threshold=5.0, smooth=True),
+        zero_gradient=("adaptation_threshold",),  # a step
+    ),
+    detector(
+        lgmd2,
+        # Inhibition of which half, as mediated, is above its lowest value, and weak enough for the ON channel to pass.
+        lambda: lgmd2.Params(threshold=1.0, mediation_scale=15.0, on_inhibition=0.2, off_inhibition=0.3, smooth=True),
+        zero_gradient=("adaptation_threshold", "joint_weight"),  # a step; in noise no cell passes both channels
+    ),
+    detector(
+        d_lgmd,
+        lambda: d_lgmd.Params(inhibition=0.2, threshold=0.2, interpolated=True, smooth=True),
+        zero_gradient=("max_threshold",),  # does not apply
+    ),
+    detector(emd, emd.Params),
+    detector(grm, grm.Params, EMD_GAIN),
+    detector(lplc2, lambda: replace(lplc2.create(5), intercept=0.3, inhibition_intercept=-0.01), EMD_GAIN),
+    replace(detector(eta, eta.Params), inputs=looming_object),
+    replace(detector(tau, tau.Params), inputs=looming_object),
     Component(
         "cpg",
         lambda: cpg.Params(substeps=2),
@@ -167,8 +215,16 @@ COMPONENTS = (
         eager=False,
     ),
 )
-each = pytest.mark.parametrize("component", COMPONENTS, ids=lambda component: component.name)
-pytestmark = pytest.mark.usefixtures("precision", "strict")
+each = pytest.mark.parametrize(
+    ("precision", "component"),
+    [
+        pytest.param(precision, component, id=f"{precision}-{component.name}")
+        for component in COMPONENTS
+        for precision in component.precisions
+    ],
+    indirect=["precision"],
+)
+pytestmark = pytest.mark.usefixtures("strict")
 
 
 def build(component: Component) -> tuple[PyTree, PyTree, PyTree]:
@@ -204,7 +260,7 @@ def signature(tree: PyTree) -> tuple[object, list]:
 
 
 @each
-def test_state_keeps_structure_shapes_and_dtypes(component):
+def test_state_keeps_structure_shapes_and_dtypes(precision, component):
     params, state, inputs = build(component)
     next_state, output = jax.eval_shape(component.step, params, state, at(inputs, 0))
     assert signature(next_state) == signature(jax.eval_shape(lambda: state))
@@ -214,7 +270,7 @@ def test_state_keeps_structure_shapes_and_dtypes(component):
 
 
 @each
-def test_jit_scan_and_vmap_equal_eager_steps_and_compile_once(component):
+def test_jit_scan_and_vmap_equal_eager_steps_and_compile_once(precision, component):
     params, state, inputs = build(component)
     traced = []
 
@@ -237,7 +293,7 @@ def test_jit_scan_and_vmap_equal_eager_steps_and_compile_once(component):
 
 
 @each
-def test_gradient_is_finite_and_reaches_every_parameter(component):
+def test_gradient_is_finite_and_reaches_every_parameter(precision, component):
     params, _, inputs = build(component)
 
     @jax.jit

@@ -1,3 +1,4 @@
+from . import bench as bench
 from . import doctor as doctor
 from . import flags as flags
 from . import main as main

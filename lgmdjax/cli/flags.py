@@ -18,7 +18,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
 from lgmdjax.errors import InputError
-from lgmdjax.evaluation.settings import TrialName, TrialPlan
+from lgmdjax.evaluation.settings import BenchScale, TrialName, TrialPlan
 from lgmdjax.pipeline import scales
 from lgmdjax.pipeline.scales import Scale
 from lgmdjax.pipeline.settings import EvaluateSettings
@@ -112,6 +112,22 @@ class WatchFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BenchFlags:
+    """What detectors are compared on, and which."""
+
+    on: tyro.conf.Positional[Literal["stimuli"]]
+    """stimuli: laboratory stimuli, from approach to a flash of light"""
+    detector: tuple[str, ...] = ("all",)
+    """detectors by name, or module:attribute for one of your own; all stands for those of lgmdjax.detectors"""
+    scale: BenchScale = "quick"
+    """smoke runs in seconds, quick in a minute, paper has l/|v| from 10 ms to 2 s"""
+    seed: int = 0
+    """seed of the noise"""
+    out: Path = Path("runs/bench")
+    """folder that holds one folder for each benchmark and scale"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorFlags:
     """The folder that is checked."""
 
@@ -173,6 +189,11 @@ def parse_trial(description: str, arguments: Sequence[str]) -> TrialFlags:
 def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
     """Read the flags of command watch."""
     return parse(WatchFlags(video=tyro.MISSING), "watch", description, arguments)
+
+
+def parse_bench(description: str, arguments: Sequence[str]) -> BenchFlags:
+    """Read the flags of command bench."""
+    return parse(BenchFlags(on=tyro.MISSING), "bench", description, arguments)
 
 
 def changed_settings(preset: object, settings: object, flag: str = "") -> dict[str, object]:

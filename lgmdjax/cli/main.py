@@ -81,6 +81,17 @@ def watch(arguments: Sequence[str]) -> None:
         print(file)
 
 
+def bench(arguments: Sequence[str]) -> None:
+    """Compare looming detectors on laboratory stimuli: table, JSON, figure."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse_bench(_summary(bench), arguments)
+    from lgmdjax.cli.bench import run_bench
+
+    for line in run_bench(given):
+        print(line, flush=True)
+
+
 def doctor(arguments: Sequence[str]) -> int:
     """Check this machine: versions, devices, arithmetic, physics, video, disk; exit code 1 after a FAIL."""
     from lgmdjax.cli import flags
@@ -101,6 +112,7 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "trial": trial,
     "study": study,
     "watch": watch,
+    "bench": bench,
     "doctor": doctor,
 }
 

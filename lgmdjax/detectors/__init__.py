@@ -1,4 +1,18 @@
-"""Looming detectors, each with `Params`, `State`, `init` and `step` (LGMD: eqs. 7-16)."""
+"""Looming detectors, each with `Params`, `State`, `init` and `step` (`protocol.Detector`).
+
+| module         | detector                                                                   |
+| -------------- | -------------------------------------------------------------------------- |
+| lgmd           | locust, Blanchard et al. 2000: the one that steers the robot (eqs. 7-16)   |
+| lgmd1_grouping | locust, Yue & Rind 2006: grouping layer                                    |
+| lgmd1_onoff    | locust, Fu et al. 2018: ON and OFF channels, adaptation                    |
+| lgmd2          | locust, Fu et al. 2020: dark objects alone                                 |
+| d_lgmd         | locust, Zhao et al. 2021: distributed excitation and inhibition            |
+| emd            | Hassenstein & Reichardt 1956: elementary motion detectors                  |
+| grm            | Chalupka et al. 2016: generalised regressive motion                        |
+| lplc2          | fruit fly, Klapoetke et al. 2017 and Zhou et al. 2022: outward motion      |
+| eta, tau       | ideal observers that are told the geometry: Gabbiani et al. 1999, Lee 1976 |
+| cells, on_off  | what several of them share                                                 |
+"""
 
 import lazy_loader
 

@@ -1,1 +1,13 @@
+from . import cells as cells
+from . import d_lgmd as d_lgmd
+from . import emd as emd
+from . import eta as eta
+from . import grm as grm
 from . import lgmd as lgmd
+from . import lgmd1_grouping as lgmd1_grouping
+from . import lgmd1_onoff as lgmd1_onoff
+from . import lgmd2 as lgmd2
+from . import lplc2 as lplc2
+from . import on_off as on_off
+from . import protocol as protocol
+from . import tau as tau

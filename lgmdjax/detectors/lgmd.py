@@ -5,21 +5,21 @@ frame later, by the changes around it. Edges that spread faster than the inhibit
 approaching object. Whole-field motion, such as a fast turn, is recognised by its total change and suppresses the
 response.
 
-| symbol    | name                        | unit        | equation |
-| --------- | --------------------------- | ----------- | -------- |
-| L_f       | frame                       | grey 0..255 | 7        |
-| P_f       | difference                  | grey        | 7        |
-| I_f       | layers.inhibition           | grey        | 8        |
-| w_I       | kernel                      | 1           | 9        |
-| E_f       | layers.excitation           | grey        | 10       |
-| S_f       | layers.summation            | grey        | 11       |
-| W_I       | inhibition                  | 1           | 11       |
-| T_s       | threshold                   | grey        | 12       |
-| U_f/n     | response.excitation         | grey        | 13, 14   |
-| u_f       | response.u                  | 1, 0.5..1   | 14, 16   |
-| FF        | response.feed_forward       | grey        | 15       |
-| w         | column_weights              | 1           | -        |
-| T_f       | suppression                 | grey        | 16       |
+| symbol | name                  | unit        | equation |
+| ------ | --------------------- | ----------- | -------- |
+| L_f    | frame                 | grey 0..255 | 7        |
+| P_f    | difference            | grey        | 7        |
+| I_f    | layers.inhibition     | grey        | 8        |
+| w_I    | kernel                | 1           | 9        |
+| E_f    | layers.excitation     | grey        | 10       |
+| S_f    | layers.summation      | grey        | 11       |
+| W_I    | inhibition            | 1           | 11       |
+| T_s    | threshold             | grey        | 12       |
+| U_f/n  | response.excitation   | grey        | 13, 14   |
+| u_f    | response.u            | 1, 0.5..1   | 14, 16   |
+| FF     | response.feed_forward | grey        | 15       |
+| w      | column_weights        | 1           | -        |
+| T_f    | suppression           | grey        | 16       |
 
 Source: Cizek & Faigl, sec. 3.3; Blanchard, Rind & Verschure 2000. Two equations contradict the text as printed and are
 corrected: eq. 15 averages the signed change, which is zero for a moving edge (`printed_feed_forward`), and eq. 16 keeps
@@ -52,7 +52,6 @@ With `smooth` both steps are sigmoids of a width in grey levels, which tend to t
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -61,10 +60,11 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
+from lgmdjax.detectors import cells
 from lgmdjax.errors import InputError
 
 KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
-U_AT_REST = 0.5  # u without motion
+U_AT_REST = cells.U_AT_REST
 FULL_WEIGHT_BEARING = math.radians(20.0)  # theta_0, up to which all cells have the same weight
 
 # w_I (eq. 9)
@@ -127,7 +127,7 @@ class Layers:
 
 def init(params: Params, frame: Float[Array, "height width"]) -> State:
     """Return the state after a first frame, before any change."""
-    _require_frame(frame)
+    cells.require_frame("lgmd", frame)
     pooled = pool(params, frame)
     return State(frame=pooled, difference=jnp.zeros_like(pooled))
 
@@ -150,18 +150,18 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
         state: from the last frame.
         frame: grey levels 0..255.
     """
-    cells = layers(params, state, frame)
-    U = _mean_excitation(params, cells.summation)
+    now = layers(params, state, frame)
+    U = _mean_excitation(params, now.summation)
     FF = _feed_forward(params, state.difference)
     u = U_AT_REST + _gate(params, FF) * (jax.nn.sigmoid(U) - U_AT_REST)
-    return State(frame=pool(params, frame), difference=cells.difference), Response(u=u, feed_forward=FF, excitation=U)
+    return State(frame=pool(params, frame), difference=now.difference), Response(u=u, feed_forward=FF, excitation=U)
 
 
 def layers(params: Params, state: State, frame: Float[Array, "height width"]) -> Layers:
     """Return the layers of cells for the next frame (eqs. 7-11)."""
-    _require_frame(frame)
+    cells.require_frame("lgmd", frame)
     pooled = pool(params, frame)
-    _require_size(pooled.shape, state.frame.shape)
+    cells.require_size("lgmd", pooled, state.frame)
     P = pooled - state.frame
     E = jnp.abs(P)
     I = inhibit(params.kernel, state.difference)  # noqa: E741
@@ -169,36 +169,12 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
 
 
 def pool(params: Params, frame: Float[Array, "height width"]) -> Float[Array, "rows columns"]:
-    """Average a frame over the square of each cell.
-
-    The number of cells is the one that comes nearest to `pooling` pixels a side. The cells divide the frame evenly,
-    pixels on a border belong to two cells in part, and mirrored frames give mirrored cells.
+    """Average a frame over the square of each cell (`lgmdjax.detectors.cells.pool`).
 
     >>> pool(Params(pooling=2), jnp.arange(8.0).reshape(2, 4)).tolist()
     [[2.5, 4.5]]
     """
-    if params.pooling == 1:
-        return frame
-    height, width = frame.shape
-    rows, columns = _cell_count(height, params.pooling), _cell_count(width, params.pooling)
-    matmul = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
-    if height % rows == 0:  # a sum of whole rows, a quarter of the product's time
-        pooled = jnp.mean(frame.reshape(rows, height // rows, width), axis=1)
-    else:
-        pooled = matmul(jnp.asarray(_pooling_weights(height, rows), frame.dtype), frame)
-    return matmul(pooled, jnp.asarray(_pooling_weights(width, columns), frame.dtype).T)
-
-
-def _cell_count(pixels: int, pooling: int) -> int:
-    return max(round(pixels / pooling), 1)
-
-
-def _pooling_weights(pixels: int, cells: int) -> Float[np.ndarray, "cells pixels"]:
-    """Return the weight of each pixel in each cell, along one side of the frame."""
-    edges = np.arange(cells + 1) * pixels / cells
-    pixel = np.arange(pixels)
-    common = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
-    return np.clip(common, 0.0, None) * cells / pixels
+    return cells.pool(frame, params.pooling)
 
 
 def inhibit(kernel: Float[Array, "5 5"], difference: Float[Array, "height width"]) -> Float[Array, "height width"]:
@@ -303,23 +279,6 @@ def column_weights(params: Params, columns: int) -> Float[np.ndarray, " columns"
     return weights / weights.mean()
 
 
-def _mean(params: Params, cells: Float[Array, "height width"]) -> Float[Array, ""]:
-    """Return the weighted mean over all cells, by a product, since XLA's sum on a CPU is not vectorised."""
-    weights = jnp.asarray(column_weights(params, cells.shape[1]), cells.dtype)
-    return jnp.sum(jnp.matmul(cells, weights, precision=lax.Precision.HIGHEST)) / cells.size
-
-
-def _require_frame(frame: Array) -> None:
-    if jnp.ndim(frame) != 2 or not jnp.issubdtype(frame.dtype, jnp.floating):
-        raise InputError(
-            f"lgmd: expected a frame of floats, grey 0..255, shape (height, width), got {frame.dtype} {frame.shape}; "
-            "use frame.astype(float), and vmap for several eyes"
-        )
-
-
-def _require_size(shape: tuple[int, ...], before: tuple[int, ...]) -> None:
-    if shape != before:
-        raise InputError(
-            f"lgmd: expected a frame of {before[1]} x {before[0]} cells as before, got {shape[1]} x {shape[0]}; "
-            "keep one resolution, or init again"
-        )
+def _mean(params: Params, layer: Float[Array, "rows columns"]) -> Float[Array, ""]:
+    """Return the mean over all cells, weighted by the bearing of their column."""
+    return cells.mean(layer, column_weights(params, layer.shape[1]))

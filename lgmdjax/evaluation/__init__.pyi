@@ -4,4 +4,6 @@ from . import gait_test as gait_test
 from . import metrics as metrics
 from . import run_trial as run_trial
 from . import settings as settings
+from . import stimulus_clips as stimulus_clips
+from . import stimulus_scores as stimulus_scores
 from . import trials as trials

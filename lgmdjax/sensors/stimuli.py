@@ -28,6 +28,8 @@ from lgmdjax.world import texture
 
 DARK, BRIGHT = 40.0, 160.0  # grey
 PANORAMA_TEXTURE = (120.0, 0.5, 0.0, 0.4)  # texture row of the surroundings, a sphere of radius 1
+OBJECT_TEXTURE = (120.0, 0.5, 2.0, 0.8)  # of a textured square of half size 1, as bright as the surroundings
+LARGEST_ANGLE = 1.5  # rad, half size beyond which an object's texture grows no more
 
 Scalar = Float[Array, ""] | float
 Image = Float[Array, "height width"]
@@ -45,8 +47,7 @@ def approach(params: camera.Params, l_over_v: Scalar, time: Scalar) -> Image:
         l_over_v: l/|v| of the square [s].
         time: t [s].
     """
-    half_angle = jnp.arctan2(jnp.asarray(l_over_v, float), jnp.maximum(-jnp.asarray(time, float), 0.0))
-    return _square(params, half_angle, 0.0)
+    return _square(params, _half_angle(l_over_v, time), 0.0)
 
 
 def recession(params: camera.Params, l_over_v: Scalar, time: Scalar) -> Image:
@@ -64,6 +65,39 @@ def translation(params: camera.Params, half_angle: Scalar, rate: Scalar, time: S
         time: t [s].
     """
     return _square(params, jnp.asarray(half_angle, float), rate * jnp.asarray(time, float))
+
+
+def elongation(params: camera.Params, half_height: Scalar, l_over_v: Scalar, time: Scalar) -> Image:
+    """Return the image of a dark bar that gets longer to both sides, as an approaching square gets wider.
+
+    Args:
+        params: of the camera.
+        half_height: half the height of the bar, which stays [rad].
+        l_over_v: l/|v| of the square [s].
+        time: t [s].
+    """
+    half_width = _half_angle(l_over_v, time)
+    return BRIGHT + (DARK - BRIGHT) * _coverage(params, half_width, jnp.asarray(half_height, float), 0.0)
+
+
+def textured_approach(params: camera.Params, l_over_v: Scalar, time: Scalar) -> Image:
+    """Return the image of a textured square on a collision course, before surroundings that are as bright.
+
+    Args:
+        params: of the camera.
+        l_over_v: l/|v| of the square [s].
+        time: t [s].
+    """
+    half_angle = _half_angle(l_over_v, time)
+    covered = _coverage(params, half_angle, half_angle, 0.0)
+    ground = _panorama(params, _about_z(jnp.zeros_like(half_angle)))
+    return ground + (_plate(params, jnp.minimum(half_angle, LARGEST_ANGLE)) - ground) * covered
+
+
+def flash(params: camera.Params, time: Scalar) -> Image:
+    """Return the image of a dark room in which a light goes on at t = 0."""
+    light = jnp.where(jnp.asarray(time, float) >= 0.0, BRIGHT, DARK)
+    return jnp.full((params.height, params.width), light)
 
 
 def grating(params: camera.Params, period: Scalar, rate: Scalar, time: Scalar) -> Image:
@@ -102,11 +136,35 @@ def roll(params: camera.Params, amplitude: Scalar, period: Scalar, time: Scalar)
 
 def _square(params: camera.Params, half_angle: Array, azimuth: Scalar) -> Image:
     """Return the image of a square with half size `half_angle` [rad], at an azimuth [rad] and at the eye's height."""
+    return BRIGHT + (DARK - BRIGHT) * _coverage(params, half_angle, half_angle, azimuth)
+
+
+def _half_angle(l_over_v: Scalar, time: Scalar) -> Float[Array, ""]:
+    return jnp.arctan2(jnp.asarray(l_over_v, float), jnp.maximum(-jnp.asarray(time, float), 0.0))
+
+
+def _coverage(params: camera.Params, half_width: Array, half_height: Array, azimuth: Scalar) -> Image:
+    """Return the part of each pixel that a rectangle covers, at an azimuth [rad] and at the eye's height."""
     d, _, _ = _directions(params)
     x, y, z = _rotate(_about_z(-jnp.asarray(azimuth, float)), d)
     pitch = params.fov / params.width  # rad per pixel
-    width, height = (jnp.clip((half_angle - jnp.abs(jnp.arctan2(side, x))) / pitch + 0.5, 0.0, 1.0) for side in (y, z))
-    return BRIGHT + (DARK - BRIGHT) * width * height
+    sides = ((half_width, y), (half_height, z))
+    width, height = (jnp.clip((half - jnp.abs(jnp.arctan2(side, x))) / pitch + 0.5, 0.0, 1.0) for half, side in sides)
+    return width * height
+
+
+def _plate(params: camera.Params, half_angle: Array) -> Image:
+    """Return the image of an endless textured plate ahead, at the distance where a half size has `half_angle`."""
+    surface = texture.prepare(jnp.asarray(OBJECT_TEXTURE, float))
+    d, d_u, d_v = _directions(params)
+    x, scale = np.maximum(d[0], 0.05), surface.frequency / jnp.tan(half_angle)  # nearly all rays with less miss it
+
+    def on_plate(derivative: np.ndarray) -> texture.Vector:
+        y, z = ((derivative[i] * x - d[i] * derivative[0]) / x**2 for i in (1, 2))
+        return jnp.zeros_like(scale * y), scale * y, scale * z
+
+    point = (jnp.zeros_like(scale * x), scale * (d[1] / x), scale * (d[2] / x))
+    return texture.grey_level(surface, point, on_plate(d_u), on_plate(d_v), bands=len(texture.WAVES))
 
 
 def _panorama(params: camera.Params, rotation: Float[Array, "3 3"]) -> Image:

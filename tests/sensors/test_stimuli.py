@@ -52,6 +52,34 @@ def test_a_translating_square_moves_left_and_keeps_its_size():
         np.testing.assert_allclose(row.sum() * PITCH, 0.4, rtol=0.01)
 
 
+def test_an_elongating_bar_keeps_its_height():
+    for time in (-0.5, -0.2, -0.1):
+        covered = darkness(stimuli.elongation(CAMERA, 0.1, 0.1, time))
+        np.testing.assert_allclose(covered[MIDDLE].sum() * PITCH, 2 * np.arctan(0.1 / -time), rtol=0.01)
+        np.testing.assert_allclose(covered[:, CAMERA.width // 2].sum() * PITCH, 0.2, rtol=0.01)
+
+
+def test_a_textured_square_grows_with_its_texture_and_is_as_bright_as_its_surroundings():
+    """Half as far away, the same point of the object is seen twice as far from the middle (by the tangent)."""
+    far, near = (np.asarray(stimuli.textured_approach(CAMERA, 0.1, time)) for time in (-0.1, -0.05))
+    angles = np.arctan(np.linspace(0.2, 0.6, 9))
+    columns = [
+        np.interp(-k, (np.arange(CAMERA.width) + 0.5) * PITCH - CAMERA.fov / 2, np.arange(CAMERA.width))
+        for k in (angles, np.arctan(2 * np.tan(angles)))
+    ]
+    rows = [
+        np.interp(columns[0], np.arange(CAMERA.width), far[MIDDLE]),
+        np.interp(columns[1], np.arange(CAMERA.width), near[MIDDLE]),
+    ]
+    assert np.corrcoef(*rows)[0, 1] > 0.95
+    assert abs(near[40:80, 60:100].mean() - 120) < 15 and near[40:80, 60:100].std() > 10
+
+
+def test_a_flash_brightens_the_whole_image_at_once():
+    np.testing.assert_array_equal(stimuli.flash(CAMERA, -1e-3), stimuli.DARK)
+    np.testing.assert_array_equal(stimuli.flash(CAMERA, 0.0), stimuli.BRIGHT)
+
+
 def test_a_grating_has_its_period_speed_and_contrast():
     period, rate, time = CAMERA.fov / 8, 0.4, 0.7
     row = np.asarray(stimuli.grating(CAMERA, period, rate, time))[MIDDLE]

@@ -4,20 +4,21 @@ The plot functions of this folder return a matplotlib `Figure` about 18 cm wide.
 so they need no window system and leave no global figure behind. Left is blue and right is orange throughout, in the
 palette of Okabe & Ito, which colour-blind readers can tell apart.
 
-| figure                                | of the paper | shows                                                    |
-| ------------------------------------- | ------------ | -------------------------------------------------------- |
-| `locomotion.plot_cpg_outputs`         | 5b           | outputs of the six CPG units from a random start         |
-| `locomotion.plot_foot_paths`          | 5c           | path of leg 1's foot, commanded and simulated            |
-| `locomotion.plot_gait_sweep`          | -            | speed and turning, commanded and simulated               |
-| `detection.plot_lgmd_layers`          | 6b           | picture, E, I and S of one eye                           |
-| `detection.plot_grid_search`          | -            | score of the candidates for T_s and W_I                  |
-| `learning.plot_losses`                | 11           | training and test error of every learner                 |
-| `learning.plot_predictions`           | 12           | u, d, the rule's v and the learned v over time           |
-| `trajectories.plot_trajectories`      | 13           | walks of all policies in one room                        |
-| `trajectories.plot_walks`             | -            | walks of a record in their rooms                         |
-| `trajectories.plot_passages`          | 14, 16       | paths past an obstacle                                   |
-| `comparison.plot_collision_rates`     | -            | collisions per 100 m of every policy, with intervals     |
-| `comparison.plot_collisions_against_coverage` | -    | the same against the floor that every policy sees        |
+| figure                                        | of the paper | shows                                                |
+| --------------------------------------------- | ------------ | ---------------------------------------------------- |
+| `locomotion.plot_cpg_outputs`                 | 5b           | outputs of the six CPG units from a random start     |
+| `locomotion.plot_foot_paths`                  | 5c           | path of leg 1's foot, commanded and simulated        |
+| `locomotion.plot_gait_sweep`                  | -            | speed and turning, commanded and simulated           |
+| `detection.plot_lgmd_layers`                  | 6b           | picture, E, I and S of one eye                       |
+| `detection.plot_grid_search`                  | -            | score of the candidates for T_s and W_I              |
+| `learning.plot_losses`                        | 11           | training and test error of every learner             |
+| `learning.plot_predictions`                   | 12           | u, d, the rule's v and the learned v over time       |
+| `trajectories.plot_trajectories`              | 13           | walks of all policies in one room                    |
+| `trajectories.plot_walks`                     | -            | walks of a record in their rooms                     |
+| `trajectories.plot_passages`                  | 14, 16       | paths past an obstacle                               |
+| `comparison.plot_collision_rates`             | -            | collisions per 100 m of every policy, with intervals |
+| `stimulus_scores.plot`                        | -            | looming detectors on laboratory stimuli              |
+| `comparison.plot_collisions_against_coverage` | -            | the same against the floor that every policy sees    |
 """
 
 import io

@@ -1,0 +1,171 @@
+"""Operations that layers of cells share: pooling, neighbourhoods, thresholds, filters, grouping, checks of a frame.
+
+| symbol    | name             | unit | meaning                                                      |
+| --------- | ---------------- | ---- | ------------------------------------------------------------ |
+| dt        | frame_time       | s    | time from one frame to the next                              |
+| tau       | time_constant    | s    | of a filter of the first order                               |
+| S         | summation        | grey | cells that are grouped                                       |
+| Ce        | -                | grey | mean of the 3 x 3 cells around each: its passing coefficient |
+| w, C_w, D | -, share, offset | grey | w = D + max |Ce| / C_w, the scale of Ce                      |
+
+The 3 x 3 kernels of the detectors depend on the distance alone, so a neighbourhood is two sums: over the four nearest
+cells and over the four diagonal ones. Such weights keep mirror symmetry whatever is learned.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from lgmdjax.errors import InputError
+from lgmdjax.minmax import amin
+
+U_AT_REST = 0.5  # response without motion
+
+Scalar = Float[Array, ""] | float
+Cells = Float[Array, "rows columns"]
+
+
+class Neighbours(NamedTuple):
+    """Sums over the cells around each cell."""
+
+    nearest: Cells  # left, right, above, below
+    diagonal: Cells
+
+
+def neighbours(cells: Cells) -> Neighbours:
+    """Return the sums over the four nearest and the four diagonal neighbours; cells on the border count as their own.
+
+    >>> neighbours(jnp.asarray([[1.0, 2.0], [3.0, 4.0]])).nearest.tolist()
+    [[7.0, 9.0], [11.0, 13.0]]
+    """
+    padded = jnp.pad(cells, 1, mode="edge")
+    vertical, middle = padded[:-2] + padded[2:], padded[1:-1]
+    nearest = vertical[:, 1:-1] + middle[:, :-2] + middle[:, 2:]
+    return Neighbours(nearest=nearest, diagonal=vertical[:, :-2] + vertical[:, 2:])
+
+
+def local_mean(cells: Cells) -> Cells:
+    """Return the mean of the 3 x 3 cells around each cell."""
+    around = neighbours(cells)
+    return (cells + around.nearest + around.diagonal) / 9
+
+
+def group(summation: Cells, share: Scalar, offset: Scalar) -> Cells:
+    """Return S Ce / w: cells in a cluster are raised up to C_w times, isolated ones are lowered (Yue & Rind 2006).
+
+    Gradient: of the maximum, that of the first largest |Ce|.
+
+    Args:
+        summation: S.
+        share: C_w.
+        offset: D, keeps the scale above zero.
+    """
+    Ce = local_mean(summation)
+    w = offset - amin(-jnp.abs(Ce).ravel(), 0) / share
+    return summation * Ce / w
+
+
+def gate(margin: Array, width: Scalar | None) -> Array:
+    """Return 1 where the margin is zero or more and else 0; with a width a sigmoid instead.
+
+    Gradient: zero for the step.
+
+    >>> gate(jnp.asarray([-1.0, 0.0, 2.0]), None).tolist()
+    [0.0, 1.0, 1.0]
+    """
+    if width is None:
+        return jnp.where(margin >= 0, jnp.ones_like(margin), jnp.zeros_like(margin))
+    return jax.nn.sigmoid(margin / width)
+
+
+def low_pass(before: Array, now: Array, frame_time: float, time_constant: Scalar) -> Array:
+    """Return the next output of a low-pass filter of the first order (backward Euler).
+
+    Args:
+        before: last output.
+        now: input.
+        frame_time: dt [s].
+        time_constant: tau [s].
+    """
+    return before + (now - before) * (frame_time / (frame_time + time_constant))
+
+
+def high_pass(before: Array, change: Array, frame_time: float, time_constant: Scalar) -> Array:
+    """Return the next output of a high-pass filter of the first order (backward Euler).
+
+    Args:
+        before: last output.
+        change: of the input since the last frame.
+        frame_time: dt [s].
+        time_constant: tau [s].
+    """
+    return (before + change) * (time_constant / (frame_time + time_constant))
+
+
+def rectify(x: Array) -> Array:
+    """Return max(x, 0).
+
+    Gradient: 0 at 0.
+    """
+    return jnp.where(x > 0, x, jnp.zeros_like(x))
+
+
+def mean(cells: Cells, weights: Float[np.ndarray, " columns"] | None = None) -> Float[Array, ""]:
+    """Return the mean over all cells; `weights` of their columns have the mean 1.
+
+    Rows are summed by a product with the weights, since XLA's sum on a CPU is not vectorised.
+    """
+    columns = jnp.ones(cells.shape[1], cells.dtype) if weights is None else jnp.asarray(weights, cells.dtype)
+    return jnp.sum(jnp.matmul(cells, columns, precision=lax.Precision.HIGHEST)) / cells.size
+
+
+def pool(frame: Float[Array, "height width"], pooling: int) -> Cells:
+    """Average a frame over the square of each cell.
+
+    The number of cells is the one that comes nearest to `pooling` pixels a side. The cells divide the frame evenly,
+    pixels on a border belong to two cells in part, and mirrored frames give mirrored cells.
+
+    >>> pool(jnp.arange(8.0).reshape(2, 4), 2).tolist()
+    [[2.5, 4.5]]
+    """
+    if pooling == 1:
+        return frame
+    height, width = frame.shape
+    rows, columns = (max(round(pixels / pooling), 1) for pixels in frame.shape)
+    if height % rows == 0:  # a sum of whole rows, a quarter of the product's time
+        inner = jnp.mean(frame.reshape(rows, height // rows, width), axis=1)
+    else:
+        weights = jnp.asarray(_pooling_weights(height, rows), frame.dtype)
+        inner = jnp.matmul(weights, frame, precision=lax.Precision.HIGHEST)
+    weights = jnp.asarray(_pooling_weights(width, columns), frame.dtype)
+    return jnp.matmul(inner, weights.T, precision=lax.Precision.HIGHEST)
+
+
+def _pooling_weights(pixels: int, cells: int) -> Float[np.ndarray, "cells pixels"]:
+    """Return the weight of each pixel in each cell, along one side of the frame."""
+    edges = np.arange(cells + 1) * pixels / cells
+    pixel = np.arange(pixels)
+    common = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
+    return np.clip(common, 0.0, None) * cells / pixels
+
+
+def require_frame(detector: str, frame: Array) -> None:
+    """Raise `InputError` unless a frame has rows and columns of floats."""
+    if jnp.ndim(frame) != 2 or not jnp.issubdtype(frame.dtype, jnp.floating):
+        raise InputError(
+            f"{detector}: expected a frame of floats, grey 0..255, shape (height, width), got {frame.dtype} "
+            f"{frame.shape}; use frame.astype(float), and vmap for several eyes"
+        )
+
+
+def require_size(detector: str, cells: Array, before: Array) -> None:
+    """Raise `InputError` unless there are as many cells as in the last frame."""
+    if cells.shape != before.shape:
+        raise InputError(
+            f"{detector}: expected a frame of {before.shape[1]} x {before.shape[0]} cells as before, got "
+            f"{cells.shape[1]} x {cells.shape[0]}; keep one resolution, or init again"
+        )

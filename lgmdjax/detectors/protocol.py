@@ -1,0 +1,51 @@
+"""What a looming detector is: four names of a module, or of any object.
+
+| name     | meaning                                                                                                  |
+| -------- | -------------------------------------------------------------------------------------------------------- |
+| Params   | a pytree; `Params()` has the published constants                                                         |
+| init     | init(params, frame) -> state                                                                             |
+| step     | step(params, state, frame) -> (state, response), for one eye; scan and vmap are the caller's             |
+| Response | has `u`, 0.5 without motion and up to 1, and `excitation`, which is not squashed; anything else is extra |
+
+Every detector of this package is one, and so is the template of the page "Write your own detector". The ideal observers
+are of the same form, but are told the object's true size instead of seeing a frame.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from flax import struct
+from jaxtyping import Array, Float
+
+from lgmdjax.detectors.cells import Scalar
+
+
+class Response(Protocol):
+    """What a detector returns for each frame."""
+
+    @property
+    def u(self) -> Float[Array, ""]: ...
+
+    @property
+    def excitation(self) -> Float[Array, ""]: ...
+
+
+class Detector(Protocol):
+    """A looming detector of one eye; modules qualify."""
+
+    @property
+    def Params(self) -> Callable[[], Any]: ...
+
+    @property
+    def init(self) -> Callable[[Any, Any], Any]: ...
+
+    @property
+    def step(self) -> Callable[[Any, Any, Any], tuple[Any, Any]]: ...
+
+
+@struct.dataclass(kw_only=True)
+class Geometry:
+    """True size and expansion of the object that an eye sees; zero where there is none."""
+
+    size: Scalar  # theta, the full angle [rad]
+    rate: Scalar  # its derivative [rad/s]

@@ -1,0 +1,210 @@
+"""How well looming detectors tell approach from everything else, on laboratory stimuli.
+
+| score       | meaning                                                                                               |
+| ----------- | ----------------------------------------------------------------------------------------------------- |
+| peaks       | largest u - 0.5 in each clip, from the third frame on                                                 |
+| selectivity | peak of a clip, over the mean peak of the approaches of a dark square                                 |
+| auc_dark    | area under ROC: peaks of the dark and the textured approaches against those of what does not approach |
+| auc_bright  | the same for the approaches of a bright square                                                        |
+| timing      | time of the peak before contact, and the line through it: slope l/|v| + intercept, with r             |
+| contrast    | peak of an approach, by contrast                                                                      |
+| noise       | peak of an approach and of a still image, by the standard deviation of the noise                      |
+
+A detector of a fixed delay delta and angular threshold theta_t has slope 1 / tan(theta_t / 2) and intercept -delta
+(Gabbiani et al. 1999). Detectors have their published constants; cells of the fly's ones are about 5 degrees wide.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pkgutil import resolve_name
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+from scipy import stats
+
+from lgmdjax.detectors import (
+    d_lgmd,
+    emd,
+    eta,
+    grm,
+    lgmd,
+    lgmd1_grouping,
+    lgmd1_onoff,
+    lgmd2,
+    lplc2,
+    protocol,
+    tau,
+)
+from lgmdjax.errors import InputError
+from lgmdjax.evaluation import stimulus_clips
+from lgmdjax.evaluation.settings import StimulusBench
+from lgmdjax.evaluation.stimulus_clips import CONTRASTS, NOISE, Clips
+from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.sensors import camera
+
+FIRST = 2  # frames in which a detector settles
+SILENT = 1e-3  # peak below which a response has no time
+FLY_CELL = np.radians(5.0)  # width of a cell of the fly's detectors
+OTHERS = ("recede", "translate", "elongate", "grating", "yaw", "sway", "flash")  # what does not approach
+
+
+class Contestant(NamedTuple):
+    """A detector, its parameters for an eye, and whether it is told the geometry instead of seeing frames."""
+
+    detector: protocol.Detector
+    params: Callable[[camera.Params], PyTree]
+    is_ideal: bool = False
+
+
+class Bench(NamedTuple):
+    """All clips of a benchmark."""
+
+    selection: Clips
+    timing: Clips
+    contrast: Clips
+    noise: Clips
+
+
+def _published(detector: Any, is_ideal: bool = False) -> Contestant:
+    return Contestant(detector, lambda _: detector.Params(), is_ideal)
+
+
+def _correlators(eye: camera.Params) -> emd.Params:
+    return emd.Params(pooling=max(round(float(FLY_CELL) * eye.width / eye.fov), 1))
+
+
+CONTESTANTS: Mapping[str, Contestant] = {
+    "lgmd": _published(lgmd),
+    "lgmd1_grouping": _published(lgmd1_grouping),
+    "lgmd1_onoff": _published(lgmd1_onoff),
+    "lgmd2": _published(lgmd2),
+    "d_lgmd": _published(d_lgmd),
+    "emd": Contestant(emd, _correlators),
+    "grm": Contestant(grm, lambda eye: grm.Params(motion=_correlators(eye))),
+    "lplc2": Contestant(lplc2, lambda eye: lplc2.Params(motion=_correlators(eye))),
+    "eta": _published(eta, is_ideal=True),
+    "tau": _published(tau, is_ideal=True),
+}
+"""Detectors by name. Their time constants are for 30 frames a second."""
+
+
+def find(name: str) -> Contestant:
+    """Return a detector by its name here, by `module:attribute`, or by `module:` for a module that is one.
+
+    >>> find("lgmdjax.detectors:lgmd2").detector.__name__
+    'lgmdjax.detectors.lgmd2'
+    """
+    if name in CONTESTANTS:
+        return CONTESTANTS[name]
+    expected = f"expected a detector among {', '.join(CONTESTANTS)}, or module:attribute"
+    if ":" not in name:
+        raise InputError(f"{expected}, got {name}; choose one")
+    try:
+        detector = resolve_name(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"{expected}, got {name} ({error}); is its folder on PYTHONPATH?") from error
+    missing = [part for part in ("Params", "init", "step") if not hasattr(detector, part)]
+    if missing:
+        raise InputError(f"{expected}, got {name} without {', '.join(missing)}; see protocol.Detector")
+    return _published(detector)
+
+
+def make_bench(settings: StimulusBench, seed: int) -> Bench:
+    """Render all clips."""
+    return Bench(
+        selection=stimulus_clips.selection(settings),
+        timing=stimulus_clips.timing(settings),
+        contrast=stimulus_clips.contrast(settings),
+        noise=stimulus_clips.noise(settings, seed),
+    )
+
+
+def score(name: str, bench: Bench) -> JsonObject:
+    """Run a detector on all clips and return its scores."""
+    contestant = find(name)
+    height, width = bench.selection.frames.shape[2:]
+    params = contestant.params(camera.Params(width=width, height=height))
+    u = {part: respond(contestant, params, clips) for part, clips in bench._asdict().items()}
+    peaks = {part: np.max(response[:, FIRST:], axis=1) for part, response in u.items()}
+    named = dict(zip(bench.selection.names, peaks["selection"].tolist(), strict=True))
+    return {
+        "detector": name,
+        "is_ideal": contestant.is_ideal,
+        "peaks": named,
+        **compare(named),
+        "timing": time_peaks(u["timing"], bench.timing),
+        "contrast": {"contrasts": list(CONTRASTS), "peaks": peaks["contrast"].tolist()},
+        "noise": {
+            "sigma": list(NOISE),
+            "approach": peaks["noise"][::2].tolist(),
+            "still": peaks["noise"][1::2].tolist(),
+        },
+    }
+
+
+def respond(contestant: Contestant, params: PyTree, clips: Clips) -> Float[np.ndarray, "clips frames"]:
+    """Return u - 0.5 for every frame after the first of every clip."""
+    inputs = clips.geometry if contestant.is_ideal else jnp.asarray(clips.frames, float)
+    return np.asarray(_respond(contestant.detector.init, contestant.detector.step, params, inputs)) - 0.5
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _respond(init: Callable[..., PyTree], step: Callable[..., Any], params: PyTree, inputs: PyTree) -> Array:
+    def one(clip: PyTree) -> Array:
+        start = init(params, jax.tree.map(lambda leaf: leaf[0], clip))
+        rest = jax.tree.map(lambda leaf: leaf[1:], clip)
+
+        def advance(state: PyTree, frame: PyTree) -> tuple[PyTree, Array]:
+            state, response = step(params, state, frame)
+            return state, response.u
+
+        return jax.lax.scan(advance, start, rest)[1]
+
+    return jax.vmap(one)(inputs)
+
+
+def compare(peaks: Mapping[str, float]) -> JsonObject:
+    """Return selectivity and both areas under ROC from the peak of each clip.
+
+    >>> peaks = {"approach dark 1 s": 0.4, "approach bright 1 s": 0.1, "recede dark 1 s": 0.2, "flash": 0.0}
+    >>> scores = compare(peaks)
+    >>> scores["auc_dark"], scores["auc_bright"], scores["selectivity"]["flash"]
+    (1.0, 0.5, 0.0)
+    """
+    dark, bright, textured = (_matching(peaks, f"approach {kind}") for kind in ("dark", "bright", "textured"))
+    others = [peak for kind in OTHERS for peak in _matching(peaks, kind)]
+    mean = float(np.mean(dark))
+    selectivity = {name: peak / mean if mean > SILENT else None for name, peak in peaks.items()}
+    return {
+        "selectivity": selectivity,
+        "auc_dark": _area(dark + textured, others),
+        "auc_bright": _area(bright, others),
+    }
+
+
+def time_peaks(response: Float[np.ndarray, "clips frames"], clips: Clips) -> JsonObject:
+    """Return the time of each peak before contact [s], None without a response, and the line through them."""
+    l_over_v = [float(name) for name in clips.names]
+    before: list[float | None] = []
+    for u in response:
+        peak = FIRST + int(np.argmax(u[FIRST:]))
+        before.append(-float(clips.time[1 + peak]) if u[peak] > SILENT else None)
+    seen = [(x, y) for x, y in zip(l_over_v, before, strict=True) if y is not None]
+    line = dict.fromkeys(("slope", "intercept", "r"))
+    if len(seen) > 2:
+        fit = stats.linregress(*np.transpose(seen))
+        r = float(fit.rvalue)  # not a number for a level line
+        line = {"slope": float(fit.slope), "intercept": float(fit.intercept), "r": r if np.isfinite(r) else None}
+    return {"l_over_v": l_over_v, "before_contact": before, **line}
+
+
+def _matching(peaks: Mapping[str, float], kind: str) -> list[float]:
+    return [peak for name, peak in peaks.items() if name.startswith(kind)]
+
+
+def _area(positive: Sequence[float], negative: Sequence[float]) -> float:
+    """Return the area under ROC: how often a positive is above a negative, ties counted half."""
+    return float(stats.mannwhitneyu(positive, negative).statistic) / (len(positive) * len(negative))
