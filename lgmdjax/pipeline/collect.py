@@ -8,8 +8,6 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lgmdjax.body import hexapod
@@ -51,11 +49,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, see
 def _calibrate(gait: Path, settings: CollectSettings, seed: int) -> JsonObject:
     """Record walks of the teacher without rendering, render them for all candidates, and select the thresholds."""
     detector = assembly.fit_detector(lgmd.Params(), settings.eyes)
-    params = assembly.with_policy(
-        _teacher_robot(gait, settings, detector),
-        "teacher",
-        jax.tree.map(lambda value: jnp.asarray(value, float), CALIBRATION_RULE),
-    )
+    params = assembly.with_teacher(_teacher_robot(gait, settings, detector), CALIBRATION_RULE)
     rooms, seconds = (
         room_batches.training_rooms(seed, CALIBRATION_EPISODE, settings.robots),
         settings.calibration_seconds,

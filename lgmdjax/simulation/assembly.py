@@ -135,6 +135,12 @@ def with_policy(params: closed_loop.Params, name: PolicyName, policy_params: PyT
     return replace(params, controller=replace(params.controller, policy=switch))
 
 
+def with_teacher(params: closed_loop.Params, rule: braitenberg.Params) -> closed_loop.Params:
+    """Return the robot with another rule, which labels its walks and which the policy `teacher` follows."""
+    rule = jax.tree.map(lambda value: jnp.asarray(value, float), rule)
+    return with_policy(replace(params, teacher=rule), "teacher", rule)
+
+
 def select_policy(params: closed_loop.Params, policy: policies.Policy) -> closed_loop.Params:
     """Return the robot with this policy active."""
     switch = replace(params.controller.policy, active=jnp.asarray(policies.POLICIES.index(policy)))

@@ -16,8 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -80,8 +78,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: SupervisionSettings,
 
 def with_rule(robot: closed_loop.Params, rule: str) -> closed_loop.Params:
     """Set the rule that labels the robot's walks, and that the policy `teacher` follows."""
-    params = jax.tree.map(lambda value: jnp.asarray(value, float), RULES[rule])
-    return assembly.with_policy(replace(robot, teacher=params), "teacher", params)
+    return assembly.with_teacher(robot, RULES[rule])
 
 
 def train_learner(
