@@ -191,7 +191,7 @@ def time_peaks(response: Float[np.ndarray, "clips frames"], clips: Clips) -> Jso
     before: list[float | None] = []
     for u in response:
         peak = FIRST + int(np.argmax(u[FIRST:]))
-        before.append(-float(clips.time[1 + peak]) if u[peak] > SILENT else None)
+        before.append(0.0 - float(clips.time[1 + peak]) if u[peak] > SILENT else None)
     seen = [(x, y) for x, y in zip(l_over_v, before, strict=True) if y is not None]
     line = dict.fromkeys(("slope", "intercept", "r"))
     if len(seen) > 2:
