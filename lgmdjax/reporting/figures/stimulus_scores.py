@@ -39,7 +39,7 @@ def grouped(row: JsonObject) -> dict[str, float | None]:
 def plot(rows: Sequence[JsonObject]) -> Figure:
     """Plot selectivity, timing, contrast and noise of every detector; rows as in scores.json."""
     figure = Figure(figsize=(style.WIDTH, 7.2), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.1, 1.0))
+    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1.0)))
     _plot_selectivity(upper.subplots(), rows)
     timing, contrast, noise = lower.subplots(1, 3)
     for colour, row in zip((COLOURS * (len(rows) // len(COLOURS) + 1)), rows, strict=False):
