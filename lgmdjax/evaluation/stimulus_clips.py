@@ -8,9 +8,9 @@
 | noise     | an approach, and a still image, with noise that is new in every pixel and frame                  |
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,9 @@ SECONDS, HOLD = 2.0, 0.2  # duration of a clip, and of what follows contact [s]
 APPROACH_LENGTH = 10.0  # l/|v|, duration of an approach whose peak is timed
 
 Frames = Float[np.ndarray, "clips frames height width"]
+Stimulus = Callable[..., Array]
+Clip = tuple[str, Any, Geometry]
+"""Name, frames, geometry."""
 
 
 class Clips(NamedTuple):
@@ -45,41 +48,44 @@ def selection(settings: StimulusBench) -> Clips:
     """Return a clip of every stimulus."""
     eye = camera.Params(width=settings.width, height=settings.height)
     time = _times(settings, SECONDS - HOLD)
-    clips = [clip for l_over_v in L_OVER_V for clip in _looming(eye, l_over_v, time)]
-    clips += [_clip(f"translate {r:g} rad/s", partial(stimuli.translation, eye, HALF_ANGLE, r), time) for r in RATES]
     middle = L_OVER_V[1]
-    bar = partial(stimuli.elongation, eye, 0.5 * HALF_ANGLE, middle)
-    clips.append(_clip("elongate", bar, time, approach_geometry(middle, time)))
-    clips.append(_clip("grating", partial(stimuli.grating, eye, 0.5, 0.5), time))
-    clips.append(_clip("yaw", partial(stimuli.yaw, eye, 0.5), time))
-    clips.append(_clip("sway", partial(stimuli.roll, eye, 0.1, 0.8), time))
-    clips.append(_clip("flash", partial(stimuli.flash, eye), time + 0.5 * SECONDS))
-    textured = partial(stimuli.textured_approach, eye, middle)
-    clips.append(_clip("approach textured", textured, time, approach_geometry(middle, time)))
-    return _stack(clips, time)
+    looms, nothing = approach_geometry(middle, time), _nothing(time)
+
+    def clip(name: str, geometry: Geometry, stimulus: Stimulus, *values: float) -> Clip:
+        return name, _render(stimulus, eye, jnp.asarray(time, float), *values), geometry
+
+    return _stack(
+        [
+            *(each for l_over_v in L_OVER_V for each in _looming(eye, l_over_v, time)),
+            *(clip(f"translate {r:g} rad/s", nothing, stimuli.translation, HALF_ANGLE, r) for r in RATES),
+            clip("elongate", looms, stimuli.elongation, 0.5 * HALF_ANGLE, middle),
+            clip("grating", nothing, stimuli.grating, 0.5, 0.5),
+            clip("yaw", nothing, stimuli.yaw, 0.5),
+            clip("sway", nothing, stimuli.roll, 0.1, 0.8),
+            ("flash", _render(stimuli.flash, eye, jnp.asarray(time + 0.5 * SECONDS, float)), nothing),
+            clip("approach textured", looms, stimuli.textured_approach, middle),
+        ],
+        time,
+    )
 
 
 def timing(settings: StimulusBench) -> Clips:
     """Return approaches with the l/|v| of the settings."""
     eye = camera.Params(width=settings.width, height=settings.height)
     time = _times(settings, APPROACH_LENGTH * max(settings.l_over_v))
-    clips = [
-        _clip(f"{l_over_v:g}", partial(stimuli.approach, eye, l_over_v), time, approach_geometry(l_over_v, time))
-        for l_over_v in settings.l_over_v
-    ]
-    return _stack(clips, time)
+    return _stack([(f"{x:g}", *_approach(eye, x, time)) for x in settings.l_over_v], time)
 
 
 def contrast(settings: StimulusBench) -> Clips:
     """Return an approach at every contrast."""
-    _, frames, geometry, time = _plain_approach(settings)
+    frames, geometry, time = _plain_approach(settings)
     clips = [(f"{c:g}", stimuli.BRIGHT + c * (frames - stimuli.BRIGHT), geometry) for c in CONTRASTS]
     return _stack(clips, time)
 
 
 def noise(settings: StimulusBench, seed: int) -> Clips:
     """Return an approach and a still image with every noise, in turn."""
-    _, frames, geometry, time = _plain_approach(settings)
+    frames, geometry, time = _plain_approach(settings)
     generator = np.random.default_rng(seed)
     still = np.broadcast_to(frames[:1], frames.shape)
     clips = []
@@ -98,20 +104,24 @@ def approach_geometry(l_over_v: float, time: Float[np.ndarray, "frames"]) -> Geo
     return Geometry(size=jnp.asarray(size, float), rate=jnp.asarray(rate, float))
 
 
-def _looming(eye: camera.Params, l_over_v: float, time: Float[np.ndarray, "frames"]) -> Iterable[tuple]:
-    """Return an approach and its reverse, each dark and bright."""
-    _, frames, geometry = _clip("", partial(stimuli.approach, eye, l_over_v), time, approach_geometry(l_over_v, time))
-    back = Geometry(size=geometry.size[::-1], rate=-geometry.rate[::-1])  # pyright: ignore[reportIndexIssue]
+def _approach(eye: camera.Params, l_over_v: float, time: Float[np.ndarray, "frames"]) -> tuple[np.ndarray, Geometry]:
+    frames = _render(stimuli.approach, eye, jnp.asarray(time, float), l_over_v)
+    return np.asarray(frames), approach_geometry(l_over_v, time)
+
+
+def _looming(eye: camera.Params, l_over_v: float, time: Float[np.ndarray, "frames"]) -> Iterator[Clip]:
+    """Yield an approach and its reverse, each dark and bright."""
+    frames, geometry = _approach(eye, l_over_v, time)
+    back = Geometry(size=jnp.flip(jnp.asarray(geometry.size)), rate=-jnp.flip(jnp.asarray(geometry.rate)))
     for polarity, images in (("dark", frames), ("bright", stimuli.DARK + stimuli.BRIGHT - frames)):
         yield f"approach {polarity} {l_over_v:g} s", images, geometry
         yield f"recede {polarity} {l_over_v:g} s", images[::-1], back
 
 
-def _plain_approach(settings: StimulusBench) -> tuple[str, np.ndarray, Geometry, np.ndarray]:
+def _plain_approach(settings: StimulusBench) -> tuple[np.ndarray, Geometry, np.ndarray]:
     eye = camera.Params(width=settings.width, height=settings.height)
     time = _times(settings, SECONDS - HOLD)
-    middle = L_OVER_V[1]
-    return *_clip("approach", partial(stimuli.approach, eye, middle), time, approach_geometry(middle, time)), time
+    return *_approach(eye, L_OVER_V[1], time), time
 
 
 def _times(settings: StimulusBench, before: float) -> Float[np.ndarray, "frames"]:
@@ -123,14 +133,13 @@ def _nothing(time: np.ndarray) -> Geometry:
     return Geometry(size=jnp.zeros(len(time)), rate=jnp.zeros(len(time)))
 
 
-def _clip(
-    name: str, stimulus: Callable[[Array], Array], time: Float[np.ndarray, "frames"], geometry: Geometry | None = None
-) -> tuple[str, np.ndarray, Geometry]:
-    frames = jax.jit(jax.vmap(stimulus))(jnp.asarray(time, float))
-    return name, np.asarray(frames), _nothing(time) if geometry is None else geometry
+@partial(jax.jit, static_argnums=(0, 1))
+def _render(stimulus: Stimulus, eye: camera.Params, time: Float[Array, "frames"], *values: Array | float) -> Array:
+    """Return the frames of a stimulus, compiled once for all values."""
+    return jax.vmap(lambda t: stimulus(eye, *values, t))(time)
 
 
-def _stack(clips: Iterable[tuple[str, np.ndarray, Geometry]], time: Float[np.ndarray, "frames"]) -> Clips:
+def _stack(clips: Iterable[Clip], time: Float[np.ndarray, "frames"]) -> Clips:
     names, frames, geometry = zip(*clips, strict=True)
     together = jax.tree.map(lambda *parts: jnp.stack(parts), *geometry)
-    return Clips(names=names, frames=np.stack(frames), geometry=together, time=time)
+    return Clips(names=names, frames=np.stack([np.asarray(images) for images in frames]), geometry=together, time=time)

@@ -191,14 +191,17 @@ def time_peaks(response: Float[np.ndarray, "clips frames"], clips: Clips) -> Jso
     before: list[float | None] = []
     for u in response:
         peak = FIRST + int(np.argmax(u[FIRST:]))
-        before.append(-float(clips.time[1 + peak]) if u[peak] > SILENT else None)
+        before.append(0.0 - float(clips.time[1 + peak]) if u[peak] > SILENT else None)
     seen = [(x, y) for x, y in zip(l_over_v, before, strict=True) if y is not None]
-    line = dict.fromkeys(("slope", "intercept", "r"))
-    if len(seen) > 2:
-        fit = stats.linregress(*np.transpose(seen))
-        r = float(fit.rvalue)  # not a number for a level line
-        line = {"slope": float(fit.slope), "intercept": float(fit.intercept), "r": r if np.isfinite(r) else None}
-    return {"l_over_v": l_over_v, "before_contact": before, **line}
+    slope, intercept, r = _line(*np.transpose(seen)) if len(seen) > 2 else (None, None, None)
+    return {"l_over_v": l_over_v, "before_contact": before, "slope": slope, "intercept": intercept, "r": r}
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float | None]:
+    """Return slope, intercept and correlation, which a level line does not have."""
+    slope, intercept = np.polyfit(x, y, 1)
+    r = float(np.corrcoef(x, y)[0, 1]) if np.ptp(y) > 0 else None
+    return float(slope), float(intercept), r
 
 
 def _matching(peaks: Mapping[str, float], kind: str) -> list[float]:

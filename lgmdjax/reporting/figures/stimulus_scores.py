@@ -23,15 +23,15 @@ GROUPS = (
 )
 """Kinds of clips, by the beginning of their names."""
 SHOWN = 1.2  # selectivity at the end of the colour scale
-COLOURS = (*style.PALETTE, style.DARK, style.GREY, style.RED, style.OBSTACLE_COLOUR)
+COLOURS = (*style.PALETTE, style.DARK, style.GREY, style.RED, "#8c564b")
 
 
 def grouped(row: JsonObject) -> dict[str, float | None]:
-    """Return the largest selectivity among the clips of each kind; None for a detector that ignores approach."""
+    """Return the mean selectivity of the clips of each kind; None for a detector that ignores approach."""
     found: dict[str, float | None] = {}
     for group in GROUPS:
         values = [value for name, value in row["selectivity"].items() if name.startswith(group)]
-        found[group] = None if None in values else max(values)
+        found[group] = None if None in values else float(np.mean(values))
     return found
 
 
@@ -39,7 +39,7 @@ def grouped(row: JsonObject) -> dict[str, float | None]:
 def plot(rows: Sequence[JsonObject]) -> Figure:
     """Plot selectivity, timing, contrast and noise of every detector; rows as in scores.json."""
     figure = Figure(figsize=(style.WIDTH, 7.2), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(1.1, 1.0))
+    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1.0)))
     _plot_selectivity(upper.subplots(), rows)
     timing, contrast, noise = lower.subplots(1, 3)
     for colour, row in zip((COLOURS * (len(rows) // len(COLOURS) + 1)), rows, strict=False):
@@ -51,7 +51,7 @@ def plot(rows: Sequence[JsonObject]) -> Figure:
         contrast.plot(row["contrast"]["contrasts"], row["contrast"]["peaks"], dashes, color=colour)
         difference = np.subtract(row["noise"]["approach"], row["noise"]["still"])
         noise.plot(row["noise"]["sigma"], difference, dashes, color=colour, label=row["detector"])
-    timing.set(xlabel="l/|v| [s]", ylabel="peak before contact [s]", xscale="log", title="Timing")
+    timing.set(xlabel="l/|v| [s]", ylabel="peak before contact [s]", title="Timing")
     contrast.set(xlabel="contrast", ylabel="peak of u - 0.5", ylim=(-0.02, 0.52), title="Contrast")
     noise.set(xlabel="noise [grey]", ylabel="peak: approach minus still", title="Noise")
     lower.legend(*noise.get_legend_handles_labels(), loc="outside lower center", ncols=5)
@@ -67,5 +67,5 @@ def _plot_selectivity(axes: Axes, rows: Sequence[JsonObject]) -> None:
     names = [f"{row['detector']}  ({row['auc_dark']:.2f})" for row in rows]
     axes.set_yticks(range(len(rows)), names)
     axes.set_xticks(range(len(GROUPS)), [group.replace(" ", "\n") for group in GROUPS])
-    axes.set_title("Peak over that to dark approach; in brackets the area under ROC of dark approach against the rest")
+    axes.set_title("Peak, over that to dark approach (with area under ROC)")
     axes.grid(False)
