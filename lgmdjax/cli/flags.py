@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args
 
 import tyro
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
 
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
 from lgmdjax.errors import InputError
@@ -90,7 +97,7 @@ class WatchFlags:
     """The video, and how the detectors see it."""
 
     video: tyro.conf.Positional[Path]
-    """any video that FFmpeg reads"""
+    """any video that FFmpeg reads; /dev/stdin for a pipe"""
     stereo: Literal["side-by-side"] | None = None
     """each frame holds the pictures of the left and the right eye, side by side"""
     mono: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -99,6 +106,8 @@ class WatchFlags:
     """folder that holds one folder for each video"""
     table: Literal["csv", "parquet"] = "csv"
     """file format of the responses, one row for each frame"""
+    overlay: bool = True
+    """write the video with the responses drawn over it; more than twice as fast without"""
     overlap: float = 0.5
     """fraction of its picture that each eye sees, from 0.5 (its half) to 1 (all of it)"""
     width: int = 320
@@ -271,6 +280,27 @@ def _read_scale(arguments: Sequence[str]) -> Scale:
 
 
 _REGISTRY = ConstructorRegistry()
+
+
+@_REGISTRY.primitive_rule
+def _read_paths(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
+    """Expand ~, and refuse an empty path, which would be the current folder."""
+    if info.type is not Path:
+        return None
+
+    def read(words: list[str]) -> Path:
+        if not words[0]:
+            # No ValueError, which tyro would print in a box.
+            raise FileNotFoundError("expected a path, got an empty one; give . for the current folder")
+        return Path(words[0]).expanduser()
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda path: [str(path)],
+    )
 
 
 @_REGISTRY.struct_rule

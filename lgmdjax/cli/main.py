@@ -1,12 +1,18 @@
 """The command line: one function for each command, which reads its own flags.
 
-A user's mistake ends in one line on stderr and exit code 2, an interruption in exit code 130. Modules are imported by
-the command that needs them: `lgmdjax --help` loads neither tyro nor JAX, and the help of a command loads no JAX.
+A user's mistake ends in one line on stderr and exit code 2, a signal in exit code 128 plus its number (130 for Ctrl-C).
+Modules are imported by the command that needs them: `lgmdjax --help` loads neither tyro nor JAX, and the help of a
+command loads no JAX.
 """
 
 import argparse
+import codecs
+import contextlib
+import io
+import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from inspect import getdoc
 from pathlib import Path
 
@@ -116,6 +122,9 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "doctor": doctor,
 }
 
+NOT_RESUMED = ("watch", "doctor")
+"""Commands that begin anew after an interruption."""
+
 STUDIES: Mapping[str, str] = {
     "velocity": "How fast should the robot walk for its detectors? (fig. 9)",
     "supervision": "Which rule should teach, and which network should learn? (sec. 3.4 and 4.2)",
@@ -137,19 +146,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
     summaries = {name: _summary(command) for name, command in COMMANDS.items()}
     name = _choose("lgmdjax", "COMMAND", DESCRIPTION, summaries, given[:1])
     prepare_jax()
-    return exit_code(lambda: COMMANDS[name](given[1:]))
+    _print_any_name()
+    with _stopping_at_signals():
+        return exit_code(lambda: COMMANDS[name](given[1:]), name)
 
 
-def exit_code(command: Callable[[], int | None]) -> int:
+def exit_code(command: Callable[[], int | None], name: str = "") -> int:
     """Run a command and return its exit code; print one line on stderr for a mistake of the user."""
     try:
         return command() or 0
     except (InputError, OSError) as error:
         print(f"lgmdjax: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("lgmdjax: interrupted; the same command resumes", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as interruption:
+        number = interruption.args[0] if interruption.args else signal.SIGINT
+        then = "starts anew, and nothing was written" if name in NOT_RESUMED else "resumes"
+        print(f"lgmdjax: interrupted by {signal.Signals(number).name}; the same command {then}", file=sys.stderr)
+        return 128 + number
+
+
+@contextlib.contextmanager
+def _stopping_at_signals() -> Iterator[None]:
+    """End the block at SIGTERM and SIGHUP as at Ctrl-C: what is unfinished is removed.
+
+    Under nohup, SIGHUP stays ignored. Signals reach the main thread alone.
+    """
+
+    def stop(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
+
+    handled = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        handled = []
+    before = {number: signal.getsignal(number) for number in handled}
+    replaced = [number for number, handler in before.items() if handler == signal.SIG_DFL]
+    for number in replaced:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in replaced:
+            signal.signal(number, before[number])
+
+
+def _print_any_name() -> None:
+    """Let stdout print the names of files that are not text in its encoding, byte by byte as they are."""
+
+    def replace(error: UnicodeError) -> tuple[str | bytes, int]:
+        try:
+            return codecs.lookup_error("surrogateescape")(error)
+        except UnicodeError:
+            return codecs.backslashreplace_errors(error)
+
+    codecs.register_error("lgmdjax-names", replace)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="lgmdjax-names")
 
 
 def _choose(program: str, noun: str, description: str, choices: Mapping[str, str], word: Sequence[str]) -> str:

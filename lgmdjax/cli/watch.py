@@ -6,16 +6,20 @@ Writes to a folder with the full name of the video:
 | ----------------------------- | ------------------------------------------------------------------ |
 | response.csv or .parquet      | the responses, one row for each frame                              |
 | response.png                  | plot of the responses over time                                    |
-| overlay.mp4                   | the pictures of both eyes, the layers E, I and S, and u over time  |
+| overlay.mp4                   | the pictures of both eyes, the layers E, I and S, and u over time; |
+|                               | not with --no-overlay                                              |
 """
 
+import contextlib
 import json
+import os
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +35,7 @@ from lgmdjax import __version__
 from lgmdjax.cli.flags import WatchFlags
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
-from lgmdjax.reporting import lgmd_overlay, video_io
+from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
 from lgmdjax.sensors import hemifield
@@ -66,7 +70,9 @@ def watch_video(flags: WatchFlags) -> list[Path]:
     given = {name: getattr(flags, name) for name in CONSTANTS}
     params = replace(lgmd.Params(), **{name: value for name, value in given.items() if value is not None})
     layout = StereoLayout(stereo=flags.stereo is not None, overlap=flags.overlap, width=flags.width)
-    return detect_looming(flags.video, flags.out, layout=layout, params=params, table=flags.table)
+    return detect_looming(
+        flags.video, flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
+    )
 
 
 def detect_looming(
@@ -76,6 +82,7 @@ def detect_looming(
     layout: StereoLayout,
     params: lgmd.Params,
     table: TableFormat = "csv",
+    overlay: bool = True,
 ) -> list[Path]:
     """Run both detectors on a video, and return the files written to out/<name of the video>/.
 
@@ -85,25 +92,33 @@ def detect_looming(
     folder = out / path.name
     with video_io.open_reader(path) as video:
         width, height = _scaled_size(path, video, layout)
-        _warn_about_rate(video)
-        overlay = lgmd_overlay.make_layout(*_split(np.zeros((height, width), np.uint8), layout).shape[1:])
+        eyes = _split(np.zeros((height, width), np.uint8), layout)
+        overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
+        _print_notes(path, video)
         with storage.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
             samples, excitations = _process(
-                frames, layout, params, overlay=overlay, target=partial_folder / "overlay.mp4", rate=video.rate
+                frames, layout, params, overlay=overlay_layout, target=partial_folder / "overlay.mp4", rate=video.rate
             )
             if len(samples) < MIN_FRAMES:
                 raise InputError(
                     f"expected a video of {MIN_FRAMES} frames or more, got {len(samples)} in {path}; take a longer one"
                 )
             responses = _table(samples, excitations, _metadata(path, video, layout, params))
-            if table == "csv":
-                pyarrow.csv.write_csv(responses, partial_folder / "response.csv")
-            else:
-                pyarrow.parquet.write_table(responses, partial_folder / "response.parquet")
+            _write_table(responses, partial_folder, table)
             (partial_folder / "response.png").write_bytes(style.to_png(plot(responses, params)))
-    for other in set(get_args(TableFormat)) - {table}:  # of an earlier call
-        (folder / f"response.{other}").unlink(missing_ok=True)
-    return [folder / name for name in (f"response.{table}", "response.png", "overlay.mp4")]
+    written = [f"response.{table}", "response.png", *(["overlay.mp4"] if overlay else [])]
+    for earlier in {"response.csv", "response.parquet", "overlay.mp4"} - set(written):
+        (folder / earlier).unlink(missing_ok=True)
+    return [folder / name for name in written]
+
+
+def _write_table(responses: pa.Table, folder: Path, table: TableFormat) -> None:
+    """Write the responses; the file is opened here, because Arrow refuses names that are not UTF-8."""
+    with (folder / f"response.{table}").open("wb") as file:
+        if table == "csv":
+            pyarrow.csv.write_csv(responses, file)
+        else:
+            pyarrow.parquet.write_table(responses, file)
 
 
 @style.styled
@@ -123,10 +138,22 @@ def plot(responses: pa.Table, params: lgmd.Params) -> Figure:
     return figure
 
 
-def _warn_about_rate(video: video_io.Video) -> None:
-    rate = float(video.rate)
-    if not 0.8 < rate / NOMINAL_RATE < 1.25:
-        print(f"note: {rate:.3g} frames a second; T_s and T_f are meant for the changes of 1/{NOMINAL_RATE} s")
+def _print_notes(path: Path, video: video_io.Video) -> None:
+    """Print on stderr what the user should know of the video, and do about it."""
+    ratio = NOMINAL_RATE / float(video.rate)
+    if not 0.8 < ratio < 1.25:
+        scaled = [f"--{name} {ratio * getattr(lgmd.Params, name):.3g}" for name in ("threshold", "suppression")]
+        print(
+            f"note: {float(video.rate):.3g} frames a second; T_s and T_f are meant for the changes of "
+            f"1/{NOMINAL_RATE} s: try {' '.join(scaled)}, or convert to {NOMINAL_RATE} frames a second",
+            file=sys.stderr,
+        )
+    if video.left_out:
+        print(
+            f"note: {path} begins between two key frames or with damage: {video.left_out} packets before the first "
+            "whole frame are left out; look whether the beginning matters",
+            file=sys.stderr,
+        )
 
 
 def _progress(video: video_io.Video, width: int, height: int) -> tqdm:
@@ -141,9 +168,9 @@ def _scaled_size(path: Path, video: video_io.Video, layout: StereoLayout) -> tup
             "crop the video, or use --mono"
         )
     pictures = 2 if layout.stereo else 1
-    full_width = video.width // pictures
+    full_width, full_height = video_geometry.square_size(video.width // pictures, video.height, video.pixel_aspect)
     width = min(layout.width, full_width)
-    height = round(video.height * width / full_width)
+    height = round(full_height * width / full_width)
     if min(width, height) < MIN_SIZE:
         raise InputError(
             f"expected pictures of {MIN_SIZE} px or more either way, got {width} x {height} from {path}; "
@@ -167,9 +194,14 @@ def _init(params: lgmd.Params, pictures: Float[Array, "2 height eye"]) -> lgmd.S
 @jax.jit
 def _step(
     params: lgmd.Params, states: lgmd.State, pictures: Float[Array, "2 height eye"]
-) -> tuple[lgmd.State, lgmd.Response, lgmd.Layers]:
+) -> tuple[lgmd.State, Float[Array, "3 2"], lgmd.Layers]:
+    """Return the next states, u, FF and excitation of both eyes, and the layers for the overlay.
+
+    The layers are also returned without an overlay: another program would round u otherwise.
+    """
     layers = jax.vmap(partial(lgmd.layers, params))(states, pictures)
-    return *jax.vmap(partial(lgmd.step, params))(states, pictures), layers
+    states, response = jax.vmap(partial(lgmd.step, params))(states, pictures)
+    return states, jnp.stack([response.u, response.feed_forward, response.excitation]), layers
 
 
 def _process(
@@ -177,18 +209,26 @@ def _process(
     layout: StereoLayout,
     params: lgmd.Params,
     *,
-    overlay: lgmd_overlay.Layout,
+    overlay: lgmd_overlay.Layout | None,
     target: Path,
     rate: Fraction,
 ) -> tuple[list[lgmd_overlay.ResponseSample], list[tuple[float, float]]]:
-    """Run the detectors over the frames and write the overlay video; return responses and excitations of each frame."""
+    """Run the detectors over the frames; return responses and excitations of each frame.
+
+    With an overlay, its video is written to the target.
+    """
     samples: list[lgmd_overlay.ResponseSample] = []
     excitations: list[tuple[float, float]] = []
-    with video_io.open_writer(target, *overlay.background.size, rate) as write:
+    threshold = float(params.threshold)
+    with contextlib.ExitStack() as stack:
+        write = None
+        if overlay is not None:
+            write = stack.enter_context(video_io.open_writer(target, *overlay.size, rate, fast=True))
         for sample, excitation, pictures, layers in _respond(frames, layout, params):
             samples.append(sample)
             excitations.append(excitation)
-            write(lgmd_overlay.render_overlay(overlay, pictures, layers, float(params.threshold), samples))
+            if overlay is not None and write is not None:
+                write(lgmd_overlay.render_overlay(overlay, pictures, layers, threshold, samples))
     return samples, excitations
 
 
@@ -203,16 +243,9 @@ def _respond(
     for frame in frames:
         pictures = _split(frame.picture, layout)
         states = _init(params, jnp.asarray(pictures)) if states is None else states
-        states, response, layers = _step(params, states, jnp.asarray(pictures))
-        u, feed_forward, excitation = (
-            _pair(value) for value in (response.u, response.feed_forward, response.excitation)
-        )
+        states, responses, layers = _step(params, states, jnp.asarray(pictures))
+        u, feed_forward, excitation = ((left, right) for left, right in np.asarray(responses).tolist())
         yield lgmd_overlay.ResponseSample(frame.time, u, feed_forward), excitation, pictures, layers
-
-
-def _pair(values: Array) -> tuple[float, float]:
-    left, right = np.asarray(values).tolist()
-    return left, right
 
 
 def _table(
@@ -230,4 +263,5 @@ def _table(
 def _metadata(path: Path, video: video_io.Video, layout: StereoLayout, params: lgmd.Params) -> dict[str, str]:
     constants = {name: float(getattr(params, name)) for name in CONSTANTS}
     facts = {"units": UNITS, "eyes": asdict(layout), "lgmd": constants, "rate": float(video.rate)}
-    return {"video": path.name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}
+    name = os.fsencode(path.name).decode("utf-8", "replace")
+    return {"video": name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}

@@ -9,15 +9,20 @@
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cache
+from typing import NamedTuple, TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Array, ArrayLike, Float, Int, UInt8, UInt16, UInt32
 from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
 from lgmdjax.detectors.lgmd import U_AT_REST, Layers
+from lgmdjax.errors import InputError
 
+FloatT = TypeVar("FloatT", float, ndarray)
 PANEL_TITLES = ("left eye | right eye, above T_s in orange", "E  excitation", "I  inhibition", "S  summation")
 LAYER_GAIN = 8.0  # of the layers, which change by only a few grey levels
 GAP, LINE_HEIGHT, CURVE_HEIGHT = 4, 20, 96  # px: between panels, of a line of text, of the curves
@@ -25,6 +30,9 @@ HISTORY_FRAMES = 150  # frames of u in the curves
 MIN_PANEL_HEIGHT = 200  # px; smaller pictures are enlarged
 BACKGROUND, TEXT_COLOUR, GRID_COLOUR = (24, 24, 24), (235, 235, 235), (90, 90, 90)
 ABOVE_THRESHOLD_COLOUR, INHIBITED_COLOUR = np.array([255.0, 130.0, 30.0]), np.array([40.0, 90.0, 255.0])
+MAX_SIZE = 8192  # px, of a video that players show
+MIN_BRIGHTNESS = 0.35  # of a coloured cell, which would be too dark to see
+GREY, ABOVE_THRESHOLD, INHIBITED = 0, 256, 512  # first index of each row of the palette
 EYE_COLOURS = ("#56B4E9", "#E69F00")  # blue and orange as in the figures, in lighter shades for a dark background
 
 
@@ -34,7 +42,12 @@ class Layout(NamedTuple):
     scale: int  # enlargement of the pictures
     panel_corners: tuple[tuple[int, int], ...]  # px: top, left of the four panels
     curve_box: tuple[int, int, int, int]  # px: left, top, right, bottom of the curves
-    background: Image.Image
+    background: UInt32[ndarray, "height width"]  # RGBA, each pixel in one number
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images [px]."""
+        return self.background.shape[1], self.background.shape[0]
 
 
 class ResponseSample(NamedTuple):
@@ -46,7 +59,7 @@ class ResponseSample(NamedTuple):
 
 
 def make_layout(rows: int, columns: int) -> Layout:
-    """Lay out the overlay of two eyes of rows x columns pixels.
+    """Lay out the overlay of two eyes of rows x columns pixels; raise InputError if it is too large for a video.
 
     >>> make_layout(60, 80).scale
     3
@@ -59,16 +72,21 @@ def make_layout(rows: int, columns: int) -> Layout:
         for column in range(2)
     )
     width, height = 2 * panel_width + 3 * GAP, 2 * (panel_height + LINE_HEIGHT) + LINE_HEIGHT + CURVE_HEIGHT
-    background = Image.new("RGB", (width + width % 2, height + height % 2), BACKGROUND)
+    if max(width, height) > MAX_SIZE:
+        raise InputError(
+            f"expected an overlay of at most {MAX_SIZE} px either way, got {width} x {height}; "
+            "lower --width, or use --no-overlay"
+        )
+    background = Image.new("RGBA", (width + width % 2, height + height % 2), BACKGROUND)
     pen = ImageDraw.Draw(background)
     for title, (top, left) in zip(PANEL_TITLES, corners, strict=True):
-        pen.text((left + 2, top - LINE_HEIGHT + 2), title, fill=TEXT_COLOUR, font=ImageFont.load_default(13))
+        pen.text((left + 2, top - LINE_HEIGHT + 2), title, fill=TEXT_COLOUR, font=_font(13))
     curve_box = (GAP + 32, height - CURVE_HEIGHT + 4, width - GAP, height - 8)
     for level in (U_AT_REST, 0.75, 1.0):
         y = _to_pixel(curve_box, level)
         pen.line([(curve_box[0], y), (curve_box[2], y)], fill=GRID_COLOUR)
-        pen.text((GAP, y - 7), f"{level:.2f}", fill=TEXT_COLOUR, font=ImageFont.load_default(11))
-    return Layout(scale, corners, curve_box, background)
+        pen.text((GAP, y - 7), f"{level:.2f}", fill=TEXT_COLOUR, font=_font(11))
+    return Layout(scale, corners, curve_box, np.array(background).view(np.uint32)[..., 0])
 
 
 def render_overlay(
@@ -77,8 +95,8 @@ def render_overlay(
     layers: Layers,
     threshold: float,
     history: Sequence[ResponseSample],
-) -> UInt8[ndarray, "height width 3"]:
-    """Render the overlay of one frame.
+) -> UInt8[ndarray, "height width 4"]:
+    """Render the overlay of one frame, in RGBA.
 
     Args:
         layout: from `make_layout`.
@@ -87,59 +105,76 @@ def render_overlay(
         threshold: T_s [grey].
         history: responses up to this frame, the last of which is this frame's.
     """
-    E, I, S = (np.asarray(layer) for layer in (layers.excitation, layers.inhibition, layers.summation))  # noqa: E741
-    is_above = (threshold <= S) & (S != 0)
-    summation = _tint(_to_rgb(LAYER_GAIN * S), S < 0, INHIBITED_COLOUR, LAYER_GAIN * np.abs(S))
-    panels = (
-        _tint(_to_rgb(pictures), is_above, ABOVE_THRESHOLD_COLOUR),
-        _to_rgb(LAYER_GAIN * E),
-        _to_rgb(LAYER_GAIN * np.abs(I)),
-        _tint(summation, is_above, ABOVE_THRESHOLD_COLOUR, LAYER_GAIN * S),
-    )
+    indices = np.asarray(_palette_indices(pictures, layers, threshold))
     image = layout.background.copy()
-    for (top, left), panel in zip(layout.panel_corners, panels, strict=True):
+    for (top, left), panel in zip(layout.panel_corners, _palette().take(indices), strict=True):
         for side, eye in enumerate(panel):
-            enlarged = Image.fromarray(eye.repeat(layout.scale, 0).repeat(layout.scale, 1))
-            image.paste(enlarged, (left + side * (enlarged.width + GAP), top))
-    _add_curves(ImageDraw.Draw(image), layout, history)
-    return np.asarray(image)
+            enlarged = eye.repeat(layout.scale, 0).repeat(layout.scale, 1) if layout.scale > 1 else eye
+            rows, columns = enlarged.shape
+            x = left + side * (columns + GAP)
+            image[top : top + rows, x : x + columns] = enlarged
+    curves_top = layout.curve_box[1] - LINE_HEIGHT
+    image[curves_top:] = _render_curves(layout, curves_top, history)
+    return image[..., None].view(np.uint8)
 
 
-def _to_rgb(values: Float[ndarray, "2 rows columns"]) -> UInt8[ndarray, "2 rows columns 3"]:
-    return np.repeat(np.clip(values, 0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+@cache
+def _palette() -> UInt32[ndarray, " 768"]:
+    """Return the colours (RGBA in one number) of grey cells, of those above the threshold and of inhibited ones.
+
+    Cells of the last two have a colour in proportion to their brightness, but never too dark to see.
+    """
+    levels = np.arange(256)
+    strength = np.clip(levels / 255, MIN_BRIGHTNESS, 1)
+    colours = np.full((3, 256, 4), 255, np.uint8)
+    colours[0, :, :3] = levels[:, None]
+    colours[1, :, :3] = strength[:, None] * ABOVE_THRESHOLD_COLOUR
+    colours[2, :, :3] = strength[:, None] * INHIBITED_COLOUR
+    return colours.reshape(-1, 4).view(np.uint32)[:, 0]
 
 
-def _tint(
-    rgb: UInt8[ndarray, "2 rows columns 3"],
-    mask: Bool[ndarray, "2 rows columns"],
-    colour: Float[ndarray, "3"],
-    brightness: ndarray | float = 255.0,
-) -> UInt8[ndarray, "2 rows columns 3"]:
-    """Colour the cells of a mask in proportion to their brightness, but never too dark to see."""
-    strength = np.clip(np.broadcast_to(brightness, mask.shape) / 255, 0.35, 1)
-    return np.where(mask[..., None], strength[..., None] * colour, rgb).astype(np.uint8)
+@jax.jit
+def _palette_indices(
+    pictures: Float[ArrayLike, "2 rows columns"], layers: Layers, threshold: float | Float[ArrayLike, ""]
+) -> UInt16[Array, "4 2 rows columns"]:
+    """Return the cells of the four panels as indices of the palette."""
+    S = layers.summation
+    is_above = (threshold <= S) & (S != 0)
+    eyes = jnp.where(is_above, ABOVE_THRESHOLD + 255, _to_level(pictures))
+    excitation, inhibition, summation = (
+        _to_level(LAYER_GAIN * jnp.abs(layer)) for layer in (layers.excitation, layers.inhibition, S)
+    )
+    colour = jnp.where(is_above, ABOVE_THRESHOLD, jnp.where(S < 0, INHIBITED, GREY))
+    return jnp.stack([eyes, excitation, inhibition, summation + colour]).astype(jnp.uint16)
 
 
-def _add_curves(pen: ImageDraw.ImageDraw, layout: Layout, history: Sequence[ResponseSample]) -> None:
-    """Add the newest response as text and the last responses as curves."""
-    now, (left, top, right, _) = history[-1], layout.curve_box
-    font = ImageFont.load_default(13)
-    pen.text((left, top - LINE_HEIGHT), f"{now.time:.2f} s", fill=TEXT_COLOUR, font=font)
+def _to_level(values: Float[ArrayLike, "2 rows columns"]) -> Int[Array, "2 rows columns"]:
+    return jnp.clip(values, 0, 255).astype(jnp.int32)
+
+
+@cache
+def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
+    """Return the font of a size, which would take longer to load than to use."""
+    return ImageFont.load_default(size)
+
+
+def _render_curves(layout: Layout, top: int, history: Sequence[ResponseSample]) -> UInt32[ndarray, "rows width"]:
+    """Render the lowest rows, with the newest response as text and the last responses as curves."""
+    image = Image.fromarray(layout.background[top:, :, None].view(np.uint8), "RGBA")
+    pen, font, now = ImageDraw.Draw(image), _font(13), history[-1]
+    left, _, right, _ = layout.curve_box
+    pen.text((left, 0), f"{now.time:.2f} s", fill=TEXT_COLOUR, font=font)
     for side, (name, colour) in enumerate(zip(("left", "right"), EYE_COLOURS, strict=True)):
         text = f"{name} eye: u {now.u[side]:.2f}, FF {now.feed_forward[side]:.1f}"
-        pen.text((left + 80 + 180 * side, top - LINE_HEIGHT), text, fill=colour, font=font)
-    shown = history[-HISTORY_FRAMES:]
+        pen.text((left + 80 + 180 * side, 0), text, fill=colour, font=font)
+    u = np.array([sample.u for sample in history[-HISTORY_FRAMES:]])
+    x = right - np.arange(len(u))[::-1] * (right - left) / HISTORY_FRAMES
     for side, colour in enumerate(EYE_COLOURS):
-        points = [
-            (
-                right - (len(shown) - 1 - i) * (right - left) / HISTORY_FRAMES,
-                _to_pixel(layout.curve_box, sample.u[side]),
-            )
-            for i, sample in enumerate(shown)
-        ]
-        pen.line(points, fill=colour, width=2)
+        y = _to_pixel(layout.curve_box, u[:, side]) - top
+        pen.line(np.stack([x, y], axis=-1).ravel().tolist(), fill=colour, width=2)
+    return np.asarray(image).view(np.uint32)[..., 0]
 
 
-def _to_pixel(curve_box: tuple[int, int, int, int], u: float) -> float:
-    """Convert a value of u into its row [px]."""
+def _to_pixel(curve_box: tuple[int, int, int, int], u: FloatT) -> FloatT:
+    """Convert values of u into their rows [px]."""
     return curve_box[3] - (u - U_AT_REST) / (1 - U_AT_REST) * (curve_box[3] - curve_box[1])

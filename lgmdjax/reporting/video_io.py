@@ -1,28 +1,34 @@
 """Read and write video files one frame at a time, with PyAV, which includes FFmpeg.
 
-Pictures are arrays 0..255 with row 0 at the top: grey (height, width) when read, RGB (height, width, 3) when written.
-At most one frame is held in memory.
+Pictures are arrays 0..255 with row 0 at the top: grey (height, width) when read, RGB or RGBA (height, width,
+channels) when written. Held in memory are one frame that is read, the compressed data of `PROBED_PACKETS`, and
+`MAX_QUEUED_PICTURES` that are written.
 """
 
 import contextlib
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import BinaryIO
 
 import av
 import numpy as np
 from av.container import InputContainer
-from av.error import FFmpegError
-from av.video.reformatter import Interpolation
+from av.error import FFmpegError, InvalidDataError
+from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from lgmdjax.errors import InputError
+from lgmdjax.reporting import video_geometry, video_source, video_timing
 
 MAX_MISSING_FRAMES = 2  # at the end of an undamaged file: containers round their duration
+PROBED_PACKETS = 240  # whose timestamps give the rate
+MAX_QUEUED_PICTURES = 4  # that wait to be encoded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,115 +45,167 @@ class Video:
 
     width: int  # px, of the upright picture
     height: int
-    rate: Fraction  # frames per second
+    pixel_aspect: Fraction  # width / height of a pixel of the upright picture
+    rate: Fraction  # frames per second, of the median spacing
     count: int  # number of frames; 0 if unknown
+    left_out: int  # damaged parts before the first whole frame: a recording may begin between two key frames
     frames: Callable[[int, int], Iterator[Frame]]  # reads the frames, area-averaged to (width, height) px
 
 
 @contextlib.contextmanager
 def open_reader(path: Path) -> Iterator[Video]:
-    """Open a video file to read it once, from the first frame to the last.
+    """Open a video file or a pipe to read it once, from the first frame to the last.
 
     Raises InputError if the file is missing or no video; while frames are read, if it is damaged or shorter than it
     declares.
     """
-    if not path.is_file():
-        raise InputError(f"expected a video file, found no file at {path}; check the path")
-    try:
-        container = av.open(str(path))
-    except (FFmpegError, ValueError) as error:
-        raise InputError(
-            f"expected a video, got {path}, which is no video or is truncated ({_reason(error)}); try to play it"
-        ) from error
-    with container:
-        if not container.streams.video:
-            raise InputError(f"expected a video, got {path}, which has no pictures; choose another file")
-        stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
-        decoded = _decode(path, container, stream)
-        first = next(decoded, None)  # only a frame contains the rotation
-        if first is None:
-            raise InputError(f"expected a video, got {path}, which has no frame; choose another file")
-        width, height = _stored_size(first, first.width, first.height)
+    with video_source.open_container(path) as container:
+        stream = video_source.choose_stream(path, container)
+        packets = container.demux(stream)
+        try:
+            probed = list(islice(packets, PROBED_PACKETS))
+        except FFmpegError as error:
+            raise _damage(path, "at its beginning", error) from error
+        rate = video_timing.frame_rate(stream, probed)
+        packets = chain(probed, packets)
+        frames, left_out = _begin(packets)
+        if not frames:
+            raise InputError(f"expected a video, got {path}, in which no frame is whole; get the whole file")
+        orientation = video_geometry.of_frame(frames[0])  # only a frame contains it
+        width, height = video_geometry.swap_axes((frames[0].width, frames[0].height), orientation)
+        aspect = stream.sample_aspect_ratio or Fraction(1)
+        decoded = _to_declared_end(path, container, stream, _decode(path, frames, packets), rate)
         yield Video(
             width=width,
             height=height,
-            rate=_rate(stream),
+            pixel_aspect=1 / aspect if orientation.transpose else aspect,
+            rate=rate,
             count=stream.frames,
-            frames=lambda width, height: _read_grey(chain([first], decoded), _rate(stream), width, height),
+            left_out=left_out,
+            frames=lambda width, height: _read_grey(decoded, rate, width, height),
         )
 
 
 @contextlib.contextmanager
 def open_writer(
-    target: Path | BinaryIO, width: int, height: int, rate: Fraction | int
-) -> Iterator[Callable[[UInt8[np.ndarray, "height width 3"]], None]]:
-    """Open an MP4 file for H.264 pictures of even width and height, and yield a function that writes one picture."""
+    target: Path | BinaryIO, width: int, height: int, rate: Fraction | int, *, fast: bool = False
+) -> Iterator[Callable[[UInt8[np.ndarray, "height width channels"]], None]]:
+    """Open an MP4 file for H.264 pictures of even width and height, and yield a function that writes one picture.
+
+    Pictures are encoded on a thread of their own; the function returns while that works.
+
+    Args:
+        target: path of the file, or a binary stream.
+        width: of the pictures [px].
+        height: of the pictures [px].
+        rate: frames per second.
+        fast: encode in a third of the time, into a file larger by a third.
+    """
     if width % 2 or height % 2:
         raise InputError(f"expected an even width and height for H.264, got {width} x {height}; pad by one")
-    with av.open(target if hasattr(target, "write") else str(target), "w", format="mp4") as container:
+    with contextlib.ExitStack() as stack:
+        # FFmpeg would take some names for the address of a protocol.
+        file = stack.enter_context(target.open("wb")) if isinstance(target, Path) else target
+        container = stack.enter_context(av.open(file, "w", format="mp4"))
         stream = container.add_stream("h264", rate=Fraction(rate).limit_denominator(90_000))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": "20", "preset": "veryfast"}
+        stream.options = {"crf": "20", "preset": "ultrafast" if fast else "veryfast"}
+        if fast:
+            stream.thread_count = 1  # its own; more would wait for each other
+        encoder = stack.enter_context(ThreadPoolExecutor(1))
+        queue: deque[Future[None]] = deque()
 
-        def write(picture: UInt8[np.ndarray, "height width 3"]) -> None:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        def encode(picture: UInt8[np.ndarray, "height width channels"] | None) -> None:
+            channels = 0 if picture is None else picture.shape[-1]
+            pixels = "rgba" if channels == 4 else "rgb24"
+            frame = None if picture is None else av.VideoFrame.from_ndarray(picture, format=pixels)
+            container.mux(stream.encode(frame))
+
+        def write(picture: UInt8[np.ndarray, "height width channels"]) -> None:
+            queue.append(encoder.submit(encode, picture))
+            if len(queue) > MAX_QUEUED_PICTURES:
+                queue.popleft().result()  # raises what the thread did
 
         yield write
-        container.mux(stream.encode())
+        queue.append(encoder.submit(encode, None))
+        for encoded in queue:
+            encoded.result()
 
 
-def _decode(path: Path, container: InputContainer, stream: VideoStream) -> Iterator[av.VideoFrame]:
-    """Decode all frames; raise InputError if the video ends earlier than the file declares."""
-    end = 0.0
-    count = 0
+def _begin(packets: Iterator[av.Packet]) -> tuple[list[av.VideoFrame], int]:
+    """Decode up to the first whole frames; return them, and the number of packets that are damaged before them."""
+    left_out = 0
+    with contextlib.suppress(FFmpegError):
+        for packet in packets:
+            try:
+                frames = _decode_packet(packet)
+            except FFmpegError:
+                left_out += 1
+                continue
+            if frames:
+                return frames, left_out
+    return [], left_out
+
+
+def _decode_packet(packet: av.Packet) -> list[av.VideoFrame]:
+    """Decode a packet; raise FFmpegError if it is damaged.
+
+    A decoder replaces what is lost by an older picture, which would be a change where nothing moved.
+    """
+    frames = [frame for frame in packet.decode() if isinstance(frame, av.VideoFrame)]
+    if packet.is_corrupt or any(frame.is_corrupt for frame in frames):
+        raise InvalidDataError(0, "a packet is lost or damaged")
+    return frames
+
+
+def _decode(path: Path, frames: list[av.VideoFrame], packets: Iterator[av.Packet]) -> Iterator[av.VideoFrame]:
+    """Yield the frames that are decoded and those of the packets; raise InputError if they are damaged."""
+    count, time = 0, None
     try:
-        for count, frame in enumerate(container.decode(stream), 1):
+        for frame in chain(frames, chain.from_iterable(map(_decode_packet, packets))):
             yield frame
-            end = frame.time if frame.time is not None else count / _rate(stream)
+            count, time = count + 1, frame.time
     except FFmpegError as error:
-        raise InputError(
-            f"expected an undamaged video, got {path}, damaged or truncated after {count} frames "
-            f"({_reason(error)}); get the whole file"
-        ) from error
-    declared = _declared_duration(container, stream)
-    if declared - end > (1 + MAX_MISSING_FRAMES) / _rate(stream):
+        raise _damage(path, f"after {count} frames" + (f", {time:.2f} s" if time is not None else ""), error) from error
+
+
+def _damage(path: Path, where: str, error: FFmpegError) -> InputError:
+    """Return the error to raise for a damaged video."""
+    remedy = "save it to a file first" if path.is_fifo() else "get the whole file, or cut out a part without damage"
+    reason = video_source.reason(error)
+    return InputError(f"expected an undamaged video, got {path}, damaged or truncated {where} ({reason}); {remedy}")
+
+
+def _to_declared_end(
+    path: Path, container: InputContainer, stream: VideoStream, frames: Iterator[av.VideoFrame], rate: Fraction
+) -> Iterator[av.VideoFrame]:
+    """Yield the frames; raise InputError if they end earlier than the file declares."""
+    end = 0.0
+    for index, frame in enumerate(frames):
+        yield frame
+        end = max(end, video_timing.end_of(frame, index, rate))
+    declared = video_timing.declared_duration(container, stream)
+    if declared - end > MAX_MISSING_FRAMES / rate:
         raise InputError(f"expected {declared:.2f} s of video, as {path} declares, got {end:.2f} s; get the whole file")
 
 
-def _declared_duration(container: InputContainer, stream: VideoStream) -> float:
-    """Return the duration of the pictures [s] that the file declares; 0 if it declares none."""
-    if stream.duration is not None and stream.time_base is not None and "mp4" in container.format.name:
-        # The number of frames would be wrong: an edit list may hide some of them.
-        return float((stream.duration + (stream.start_time or 0)) * stream.time_base)
-    if stream.frames:
-        return float(stream.frames / _rate(stream))
-    is_only_stream = len(container.streams) == 1  # otherwise the sound may be longer
-    return (container.duration or 0) / av.time_base if is_only_stream else 0.0
-
-
 def _read_grey(frames: Iterator[av.VideoFrame], rate: Fraction, width: int, height: int) -> Iterator[Frame]:
-    """Convert frames to grey, upright and of the given size."""
+    """Convert frames to grey, upright and of the given size.
+
+    Brightness does not depend on the matrix of the colours (BT.601, 709, 2020), but FFmpeg's conversion is exact for
+    BT.601 alone: the others are a level too dark where a picture is scaled.
+    """
+    reformatter = VideoReformatter()  # that of a frame would be made anew for each
     for index, frame in enumerate(frames):
-        stored = _stored_size(frame, width, height)
-        small = frame.reformat(*stored, format="gray", interpolation=Interpolation.AREA)
-        upright = np.rot90(small.to_ndarray(), _quarter_turns(frame))
-        yield Frame(time=frame.time if frame.time is not None else index / float(rate), picture=upright)
-
-
-def _stored_size(frame: av.VideoFrame, width: int, height: int) -> tuple[int, int]:
-    """Swap width and height if the picture is stored rotated by a quarter turn."""
-    return (height, width) if _quarter_turns(frame) % 2 else (width, height)
-
-
-def _quarter_turns(frame: av.VideoFrame) -> int:
-    """Return the number of counterclockwise quarter turns that make the stored picture upright."""
-    return round(frame.rotation / 90)
-
-
-def _rate(stream: VideoStream) -> Fraction:
-    return stream.average_rate or stream.guessed_rate or Fraction(30)
-
-
-def _reason(error: Exception) -> str:
-    return (getattr(error, "strerror", None) or str(error)).lower()
+        orientation = video_geometry.of_frame(frame)
+        stored = video_geometry.swap_axes((width, height), orientation)
+        small = reformatter.reformat(
+            frame,
+            *stored,
+            format="gray",
+            src_colorspace=Colorspace.ITU601,
+            dst_colorspace=Colorspace.ITU601,
+            interpolation=Interpolation.AREA,
+        )
+        picture = video_geometry.to_upright(small.to_ndarray(), orientation)
+        yield Frame(time=frame.time if frame.time is not None else index / float(rate), picture=picture)

@@ -11,6 +11,7 @@
 import contextlib
 import json
 import os
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialise
 
@@ -29,6 +31,12 @@ JsonObject = dict[str, Any]
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shapes of arrays by name."""
+
+PARTIAL_PREFIX = ".partial-"
+"""Of the temporary folders of `replacing_all`."""
+
+LOCK_NAME = ".lock"
+"""File in a temporary folder, locked while a process works there."""
 
 STAGE_COMMANDS = ("fit-gait", "collect", "train", "evaluate", "report")
 """Commands that write a folder of their own name."""
@@ -62,21 +70,32 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
 def replacing_all(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder; at the end of the block its files move into `folder`, which is made if need be.
 
-    A block that raises leaves `folder` as it was.
+    A block that raises leaves `folder` as it was. What a killed process left there is removed; its lock tells that it
+    has ended.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        work = tempfile.TemporaryDirectory(prefix=".partial-", dir=folder)
+        for abandoned in folder.glob(f"{PARTIAL_PREFIX}*"):
+            _remove_abandoned(abandoned)
+        work = tempfile.TemporaryDirectory(prefix=PARTIAL_PREFIX, dir=folder)
     except OSError as error:
         raise not_writable(folder, error) from error
     try:
-        with work:
+        with work, FileLock(Path(work.name) / LOCK_NAME):
             yield Path(work.name)
             for file in Path(work.name).iterdir():
-                os.replace(file, folder / file.name)
+                if file.name != LOCK_NAME:
+                    os.replace(file, folder / file.name)
     finally:
         with contextlib.suppress(OSError):  # the folder has other files
             folder.rmdir()
+
+
+def _remove_abandoned(partial: Path) -> None:
+    """Remove a temporary folder of `replacing_all` unless a process works in it."""
+    lock = FileLock(partial / LOCK_NAME)
+    with contextlib.suppress(Timeout, OSError), lock.acquire(timeout=0):
+        shutil.rmtree(partial)
 
 
 def remove_partial_files(folder: Path) -> None:

@@ -41,6 +41,10 @@ _COARSE_RESOLUTION = 25.0
 """Below this resolution [px/rad] tiles are at least 2 x 4 pixels, above it 4 x 8, which are twice as fast."""
 
 
+MAX_SIZE = 4096
+"""Largest width and height of a picture [px]: at the paper's field of view, a pair takes about half a gigabyte."""
+
+
 @struct.dataclass(kw_only=True, frozen=True)
 class Params:
     """Structure of the camera, all of it static. Raises InputError for values that are not possible.
@@ -69,6 +73,11 @@ class Params:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise InputError(f"expected camera {name} as a whole number above 0, got {value!r}; change it")
+        if max(self.width, self.height) > MAX_SIZE:
+            raise InputError(
+                f"expected camera pictures of at most {MAX_SIZE} px either way, got {self.width} x {self.height}; "
+                "choose a smaller width"
+            )
         if self.bands > len(WAVES):
             raise InputError(f"expected at most {len(WAVES)} texture bands, got {self.bands}; lower camera bands")
         hemifield.check(self.overlap, self.ground)

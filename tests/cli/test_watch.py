@@ -1,6 +1,11 @@
 """`lgmdjax watch`: a disc that looms on the right excites the right eye; a bad video leaves no files."""
 
+import io
 import json
+import os
+import signal
+import time
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -10,10 +15,12 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
+from filelock import FileLock
 
 from lgmdjax.cli import main
 from lgmdjax.cli.watch import StereoLayout, detect_looming
 from lgmdjax.detectors import lgmd
+from lgmdjax.errors import InputError
 from lgmdjax.reporting import lgmd_overlay, video_io
 
 WIDTH, HEIGHT, FRAMES = 96, 64, 40
@@ -144,6 +151,7 @@ def test_the_overlay_shows_every_frame_and_marks_the_cells_above_threshold(tmp_p
         ("good", ("--overlap", "0.2"), "overlap"),
         ("good", ("--width", "8"), "16 px or more"),
         ("good", ("--width", "-8"), "16 px or more"),
+        ("good", ("--out", ""), "a path, got an empty one"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_no_files(
@@ -208,4 +216,88 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pyt
 def test_an_unusual_frame_rate_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save(tmp_path / "fast.mp4", looming(72), rate=120)
     detect_looming(path, tmp_path / "out", layout=StereoLayout(), params=lgmd.Params())
-    assert "120 frames a second" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert not captured.out
+    assert "120 frames a second" in captured.err and "--threshold 1.5 --suppression 5" in captured.err
+
+
+def test_without_an_overlay_the_responses_are_the_same(tmp_path: Path) -> None:
+    path = save(tmp_path / "disc.mp4", looming(72))
+    assert main.main(["watch", str(path), "--out", str(tmp_path / "out")]) == 0
+    folder = tmp_path / "out" / "disc.mp4"
+    with_overlay = (folder / "response.csv").read_bytes()
+    assert main.main(["watch", str(path), "--out", str(tmp_path / "out"), "--no-overlay"]) == 0
+    assert (folder / "response.csv").read_bytes() == with_overlay
+    assert sorted(file.name for file in folder.iterdir()) == ["response.csv", "response.png"]
+
+
+@pytest.mark.parametrize("name", ["12:30:05.mp4", "-x.mp4", b"caf\xe9.mp4"])
+def test_any_name_of_a_video_will_do(tmp_path: Path, name: str | bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names that look like protocols or flags, that are not UTF-8, and ~."""
+    path = save(tmp_path / "a.mp4", looming(72, 4)).rename(tmp_path / os.fsdecode(name))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main.main(["watch", "--out", "~/out", "--table", "parquet", "--", path.name]) == 0
+    written = sorted(file.name for file in (tmp_path / "out" / path.name).iterdir())
+    assert written == ["overlay.mp4", "response.parquet", "response.png"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])  # of the locales C.UTF-8 and POSIX
+def test_the_names_of_files_are_printed_as_they_are(
+    tmp_path: Path, encoding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = save(tmp_path / "a.mp4", looming(72, 4)).rename(tmp_path / os.fsdecode(b"caf\xe9.mp4"))
+    printed = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(printed, encoding, write_through=True))
+    assert main.main(["watch", str(path), "--out", str(tmp_path / "out"), "--no-overlay"]) == 0
+    assert printed.getvalue().split(b"\n")[0].endswith(b"out/caf\xe9.mp4/response.csv")
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_signal_leaves_no_files(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The signal comes when the overlay is written in part."""
+    path, number = save(tmp_path / "disc.mp4", looming(72, 4)), signal.Signals[name]
+    handler = signal.getsignal(number)
+    monkeypatch.setattr(
+        "lgmdjax.reporting.lgmd_overlay.render_overlay", lambda *_: os.kill(os.getpid(), number) or time.sleep(1)
+    )
+    assert main.main(["watch", str(path), "--out", str(tmp_path / "out")]) == 128 + number
+    (line,) = stderr_lines(capsys)
+    assert f"interrupted by {name}" in line and "nothing was written" in line
+    assert not [file for file in (tmp_path / "out").rglob("*") if file.is_file()]
+    assert signal.getsignal(number) == handler
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    path = save(tmp_path / "disc.mp4", looming(72))
+    for name in ("killed", "at-work"):
+        (tmp_path / "out" / "disc.mp4" / f".partial-{name}").mkdir(parents=True)
+        (tmp_path / "out" / "disc.mp4" / f".partial-{name}" / "overlay.mp4").touch()
+    with FileLock(tmp_path / "out" / "disc.mp4" / ".partial-at-work" / ".lock"):
+        assert main.main(["watch", str(path), "--out", str(tmp_path / "out")]) == 0
+        hidden = [file.name for file in (tmp_path / "out" / "disc.mp4").iterdir() if file.name.startswith(".")]
+    assert hidden == [".partial-at-work"]
+
+
+def test_oblong_pixels_are_made_square(tmp_path: Path) -> None:
+    """The picture of a video of 96 x 64 pixels, each 3/2 as wide as high, has 64 : 43 as its sides."""
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("h264", rate=30)
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.sample_aspect_ratio = Fraction(3, 2)
+        for grey in looming(72, 4):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(grey, format="gray")))
+        container.mux(stream.encode())
+    run(path)
+    layout = lgmd_overlay.make_layout(43, WIDTH // 2)
+    with av.open(str(tmp_path / "out" / "a.mp4" / "overlay.mp4")) as container:
+        assert (container.streams.video[0].width, container.streams.video[0].height) == layout.size
+
+
+def test_an_overlay_too_large_for_a_video_is_refused() -> None:
+    with pytest.raises(InputError, match="no-overlay"):
+        lgmd_overlay.make_layout(2000, 4000)
