@@ -50,12 +50,15 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, UInt8
 
 from lgmdjax.errors import InputError
 
 KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
 U_AT_REST = 0.5  # u without motion
+
+Frame = Float[Array, "height width"] | UInt8[Array, "height width"]
+"""An image of one eye, grey levels 0..255, in floating point or as a camera delivers it."""
 
 # w_I (eq. 9)
 KERNEL = (
@@ -113,14 +116,14 @@ class Layers:
     summation: Float[Array, "rows columns"]  # S, eq. 11, before the threshold
 
 
-def init(params: Params, frame: Float[Array, "height width"]) -> State:
+def init(params: Params, frame: Frame) -> State:
     """Return the state after a first frame, before any change."""
     _require_frame(frame)
     pooled = pool(params, frame)
     return State(frame=pooled, difference=jnp.zeros_like(pooled))
 
 
-def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
+def step(params: Params, state: State, frame: Frame) -> tuple[State, Response]:
     """Process the next frame (eqs. 7-16).
 
     Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
@@ -145,7 +148,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
     return State(frame=pool(params, frame), difference=cells.difference), Response(u=u, feed_forward=FF, excitation=U)
 
 
-def layers(params: Params, state: State, frame: Float[Array, "height width"]) -> Layers:
+def layers(params: Params, state: State, frame: Frame) -> Layers:
     """Return the layers of cells for the next frame (eqs. 7-11)."""
     _require_frame(frame)
     pooled = pool(params, frame)
@@ -156,29 +159,47 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
     return Layers(difference=P, excitation=E, inhibition=I, summation=E - jnp.abs(I) * params.inhibition)
 
 
-def pool(params: Params, frame: Float[Array, "height width"]) -> Float[Array, "rows columns"]:
+def pool(params: Params, frame: Frame) -> Float[Array, "rows columns"]:
     """Average a frame over the square of each cell.
 
     The number of cells is the one that comes nearest to `pooling` pixels a side. The cells divide the frame evenly,
     pixels on a border belong to two cells in part, and mirrored frames give mirrored cells.
 
+    The sums of an 8-bit frame are whole numbers, exact in any order. So all machines and compilers get the same cells,
+    and agree about a cell at the threshold.
+
     >>> pool(Params(pooling=2), jnp.arange(8.0).reshape(2, 4)).tolist()
     [[2.5, 4.5]]
     """
     if params.pooling == 1:
-        return frame
-    rows, columns = (jnp.asarray(_pooling_weights(size, params.pooling), frame.dtype) for size in frame.shape)
+        return _as_float(frame)
+    (rows, row_total), (columns, column_total) = (pooling_parts(size, params.pooling) for size in frame.shape)
+    if frame.dtype == jnp.uint8:
+        sums = _sum_cells(rows, _as_float(frame), columns)
+        # The zero hides a constant: XLA would multiply by its inverse, and in some programs fuse that product with the
+        # difference of two frames, which is then rounded otherwise.
+        return sums / (row_total * column_total + 0 * sums[0, 0])
+    return _sum_cells(rows / row_total, frame, columns / column_total)
+
+
+def _sum_cells(rows: np.ndarray, frame: Float[Array, "height width"], columns: np.ndarray) -> Array:
     matmul = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
-    return matmul(matmul(rows, frame), columns.T)
+    return matmul(matmul(jnp.asarray(rows, frame.dtype), frame), jnp.asarray(columns, frame.dtype).T)
 
 
-def _pooling_weights(pixels: int, pooling: int) -> Float[np.ndarray, "cells pixels"]:
-    """Return the weight of each pixel in each cell, along one side of the frame."""
+def pooling_parts(pixels: int, pooling: int) -> tuple[Int[np.ndarray, "cells pixels"], int]:
+    """Return how much of each pixel is in each cell, along one side of the frame, in parts of which a cell has `total`.
+
+    >>> pooling_parts(5, 2)  # the pixel in the middle is in both cells
+    (array([[2, 2, 1, 0, 0],
+           [0, 0, 1, 2, 2]]), 5)
+    """
     cells = max(round(pixels / pooling), 1)
-    edges = np.arange(cells + 1) * pixels / cells
-    pixel = np.arange(pixels)
-    common = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
-    return np.clip(common, 0.0, None) * cells / pixels
+    divisor = math.gcd(cells, pixels)
+    total, part = pixels // divisor, cells // divisor
+    cell, pixel = np.arange(cells)[:, None], np.arange(pixels)
+    common = np.minimum((cell + 1) * total, (pixel + 1) * part) - np.maximum(cell * total, pixel * part)
+    return np.maximum(common, 0), total
 
 
 def inhibit(kernel: Float[Array, "5 5"], difference: Float[Array, "height width"]) -> Float[Array, "height width"]:
@@ -191,7 +212,7 @@ def inhibit(kernel: Float[Array, "5 5"], difference: Float[Array, "height width"
     """
     height, width = difference.shape
     padded = jnp.pad(difference, KERNEL_RADIUS)
-    quarter = _quarter(kernel).astype(difference.dtype)
+    quarter = kernel_quarter(kernel).astype(difference.dtype)
 
     def row(i: int) -> Array:
         return lax.slice_in_dim(padded, KERNEL_RADIUS + i, KERNEL_RADIUS + i + height, axis=0)
@@ -246,7 +267,7 @@ def _mean_excitation(params: Params, summation: Float[Array, "height width"]) ->
     return _mean(jnp.abs(passed))
 
 
-def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
+def kernel_quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
     """Return the weights by distance in rows and columns, averaged over the kernel's four mirror images."""
     w = (kernel + kernel[::-1]) / 2
     return ((w + w[:, ::-1]) / 2)[KERNEL_RADIUS:, KERNEL_RADIUS:]
@@ -272,11 +293,15 @@ def _mean(cells: Float[Array, "height width"]) -> Float[Array, ""]:
     return jnp.sum(jnp.matmul(cells, ones, precision=lax.Precision.HIGHEST)) / cells.size
 
 
+def _as_float(frame: Frame) -> Float[Array, "height width"]:
+    return frame.astype(float) if frame.dtype == jnp.uint8 else frame
+
+
 def _require_frame(frame: Array) -> None:
-    if jnp.ndim(frame) != 2 or not jnp.issubdtype(frame.dtype, jnp.floating):
+    if jnp.ndim(frame) != 2 or not (jnp.issubdtype(frame.dtype, jnp.floating) or frame.dtype == jnp.uint8):
         raise InputError(
-            f"lgmd: expected a frame of floats, grey 0..255, shape (height, width), got {frame.dtype} {frame.shape}; "
-            "use frame.astype(float), and vmap for several eyes"
+            f"lgmd: expected a frame of floats or uint8, grey 0..255, shape (height, width), got {frame.dtype} "
+            f"{frame.shape}; use frame.astype(float), and vmap for several eyes"
         )
 
 
