@@ -17,6 +17,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
+from lgmdjax.deployment.formats import FORMATS, PRETRAINED, Format
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation.settings import TrialName, TrialPlan
 from lgmdjax.pipeline import scales
@@ -112,6 +113,24 @@ class WatchFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportFlags:
+    """The robot, and where its nervous system is written."""
+
+    robot: tyro.conf.Positional[Path]
+    """run folder of the robot, or the word pretrained for the one that comes with the package"""
+    out: tyro.conf.Positional[Path]
+    """folder to write, which must be empty or missing"""
+    width: int | None = None
+    """width of the pictures [px], 320 in the paper; if left out that of the robot's training"""
+    formats: tuple[Format, ...] = FORMATS
+    """programs to write; onnx needs the extra `onnx`"""
+
+    def run(self) -> Path | None:
+        """Return the run folder; None stands for the pretrained robot."""
+        return None if self.robot == Path(PRETRAINED) else self.robot
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorFlags:
     """The folder that is checked."""
 
@@ -173,6 +192,14 @@ def parse_trial(description: str, arguments: Sequence[str]) -> TrialFlags:
 def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
     """Read the flags of command watch."""
     return parse(WatchFlags(video=tyro.MISSING), "watch", description, arguments)
+
+
+def parse_export(description: str, arguments: Sequence[str]) -> ExportFlags:
+    """Read the flags of command export."""
+    flags = parse(ExportFlags(robot=tyro.MISSING, out=tyro.MISSING), "export", description, arguments)
+    if not flags.formats:
+        raise InputError(f"expected one or more --formats, got none; choose from {', '.join(FORMATS)}")
+    return flags
 
 
 def changed_settings(preset: object, settings: object, flag: str = "") -> dict[str, object]:
