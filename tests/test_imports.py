@@ -15,6 +15,7 @@ WINGS = (
     "learning",
     "evaluation",
     "reporting",
+    "deployment",
     "simulation",
     "control",
     "detectors",

@@ -57,6 +57,7 @@ class _Anatomy(NamedTuple):
     """Indices and offsets in the XML, read once."""
 
     stance: np.ndarray  # (25,) qpos of the default stance
+    limits: np.ndarray  # (2, 6, 3) rad, lowest and highest set points of the servos
     eyes: np.ndarray  # (2, 3) m, in the trunk's frame
     laser: np.ndarray  # (3,) m, in the trunk's frame
     capsules: np.ndarray  # (13,) ids of `CAPSULES`
@@ -139,6 +140,7 @@ def _anatomy() -> _Anatomy:
 
     return _Anatomy(
         stance=model.key("stance").qpos.copy(),
+        limits=model.actuator_ctrlrange.T.reshape(2, 6, 3).copy(),
         eyes=np.stack([model.site(name).pos for name in EYES]),
         laser=model.site("laser").pos.copy(),
         capsules=geom_ids([*CAPSULES]),
@@ -168,6 +170,15 @@ def stance() -> Float[np.ndarray, "6 3"]:
     (6, 3)
     """
     return _anatomy().stance[7:].reshape(6, 3)
+
+
+def target_limits() -> Float[np.ndarray, "2 6 3"]:
+    """Return the lowest and the highest set points of the servos [rad], to which `substep` clips them.
+
+    >>> np.rad2deg(target_limits()[:, 0]).round().tolist()  # coxa, femur, tibia
+    [[-75.0, -100.0, -102.0], [75.0, 100.0, 67.0]]
+    """
+    return _anatomy().limits
 
 
 def init(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:

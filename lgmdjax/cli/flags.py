@@ -24,6 +24,7 @@ from tyro.constructors import (
 )
 
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
+from lgmdjax.deployment.formats import FORMATS, PRETRAINED, Format
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation.settings import BenchScale, TrialName, TrialPlan
 from lgmdjax.pipeline import scales
@@ -137,6 +138,24 @@ class BenchFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportFlags:
+    """The robot, and where its nervous system is written."""
+
+    robot: tyro.conf.Positional[Path]
+    """run folder of the robot, or the word pretrained for the one that comes with the package"""
+    out: tyro.conf.Positional[Path]
+    """folder to write, which must be empty or missing"""
+    width: int | None = None
+    """width of the pictures [px], 320 in the paper; if left out that of the robot's training"""
+    formats: tuple[Format, ...] = FORMATS
+    """programs to write; onnx needs the extra `onnx`"""
+
+    def run(self) -> Path | None:
+        """Return the run folder; None stands for the pretrained robot."""
+        return None if self.robot == Path(PRETRAINED) else self.robot
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorFlags:
     """The folder that is checked."""
 
@@ -203,6 +222,14 @@ def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
 def parse_bench(description: str, arguments: Sequence[str]) -> BenchFlags:
     """Read the flags of command bench."""
     return parse(BenchFlags(on=tyro.MISSING), "bench", description, arguments)
+
+
+def parse_export(description: str, arguments: Sequence[str]) -> ExportFlags:
+    """Read the flags of command export."""
+    flags = parse(ExportFlags(robot=tyro.MISSING, out=tyro.MISSING), "export", description, arguments)
+    if not flags.formats:
+        raise InputError(f"expected one or more --formats, got none; choose from {', '.join(FORMATS)}")
+    return flags
 
 
 def changed_settings(preset: object, settings: object, flag: str = "") -> dict[str, object]:

@@ -76,6 +76,17 @@ def study(arguments: Sequence[str]) -> None:
     print(f"look into {run_study(name, given)}")
 
 
+def export(arguments: Sequence[str]) -> None:
+    """Write a robot's nervous system as ONNX, StableHLO and C99, to run it without this package."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse_export(_summary(export), arguments)
+    from lgmdjax.cli.export import export_robot
+
+    for line in export_robot(given):
+        print(line)
+
+
 def watch(arguments: Sequence[str]) -> None:
     """Run the two looming detectors on a video: responses of each frame, plot, overlay video."""
     from lgmdjax.cli import flags
@@ -119,6 +130,7 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "study": study,
     "watch": watch,
     "bench": bench,
+    "export": export,
     "doctor": doctor,
 }
 

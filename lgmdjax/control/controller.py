@@ -22,12 +22,15 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
 from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.sensors import hemifield
+
+Frames = Float[Array, "2 height width"] | UInt8[Array, "2 height width"]
+"""Images of the left and the right eye (`lgmd.Frame`)."""
 
 
 @struct.dataclass(kw_only=True)
@@ -50,7 +53,7 @@ class State:
     velocity: Float[Array, "2"]
 
 
-def init(params: Params, frames: Float[Array, "2 height width"], policy: Policy, key: Array) -> State:
+def init(params: Params, frames: Frames, policy: Policy, key: Array) -> State:
     """Return the state at a first stereo frame: zero velocity, and the CPG on its limit cycle."""
     return State(
         lgmd=init_lgmd(params, frames),
@@ -60,16 +63,36 @@ def init(params: Params, frames: Float[Array, "2 height width"], policy: Policy,
     )
 
 
-def init_lgmd(params: Params, frames: Float[Array, "2 height width"]) -> lgmd.State:
+def init_lgmd(params: Params, frames: Frames) -> lgmd.State:
     """Return the states of both LGMDs at a first stereo frame, so that their first frame difference is zero."""
     return jax.vmap(lgmd.init, in_axes=(None, 0))(params.lgmd, hemifield.outermost_first(frames))
 
 
-def detect(params: Params, state: State, frames: Float[Array, "2 height width"]) -> tuple[State, lgmd.Response]:
+def detect(params: Params, state: State, frames: Frames) -> tuple[State, lgmd.Response]:
     """Step both LGMDs by one stereo frame (eqs. 7-16); the response has one entry for each eye, left first."""
     frames = hemifield.outermost_first(frames)
     lgmd_state, response = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(params.lgmd, state.lgmd, frames)
     return replace(state, lgmd=lgmd_state), response
+
+
+def detect_or_start(
+    params: Params, state: State, frames: Frames, is_first: Bool[Array, ""]
+) -> tuple[State, lgmd.Response]:
+    """Step both LGMDs as `detect` does, at a first frame from the states of `init_lgmd`."""
+    started = init_lgmd(params, frames)
+    before = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), started, state.lgmd)
+    return detect(params, replace(state, lgmd=before), frames)
+
+
+def observe_without_laser(response: lgmd.Response) -> Observation:
+    """Return the observation of a robot without a laser scanner: distances are zero, so no policy may need them."""
+    return Observation(
+        u=response.u,
+        feed_forward=response.feed_forward,
+        excitation=response.excitation,
+        distances=jnp.zeros(2),
+        corridor=jnp.zeros(2),
+    )
 
 
 def decide(params: Params, state: State, observation: Observation, policy: Policy) -> State:
@@ -86,19 +109,9 @@ def move(params: Params, state: State, interval: float) -> tuple[State, Float[Ar
 
 
 def step(
-    params: Params, state: State, frames: Float[Array, "2 height width"], policy: Policy, interval: float
+    params: Params, state: State, frames: Frames, policy: Policy, interval: float
 ) -> tuple[State, Float[Array, "6 3"]]:
-    """Turn one stereo frame into joint targets [rad]: detect, decide, move.
-
-    Without a laser scanner the distances of the observation are zero, so the policy must not need them.
-    """
+    """Turn one stereo frame into joint targets [rad]: detect, decide, move (`observe_without_laser`)."""
     state, response = detect(params, state, frames)
-    observation = Observation(
-        u=response.u,
-        feed_forward=response.feed_forward,
-        excitation=response.excitation,
-        distances=jnp.zeros(2),
-        corridor=jnp.zeros(2),
-    )
-    state = decide(params, state, observation, policy)
+    state = decide(params, state, observe_without_laser(response), policy)
     return move(params, state, interval)

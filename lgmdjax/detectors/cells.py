@@ -12,13 +12,14 @@ The 3 x 3 kernels of the detectors depend on the distance alone, so a neighbourh
 cells and over the four diagonal ones. Such weights keep mirror symmetry whatever is learned.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, UInt8
 
 from lgmdjax.errors import InputError
 from lgmdjax.minmax import amin
@@ -27,6 +28,7 @@ U_AT_REST = 0.5  # response without motion
 
 Scalar = Float[Array, ""] | float
 Cells = Float[Array, "rows columns"]
+Frame = Float[Array, "height width"] | UInt8[Array, "height width"]
 
 
 class Neighbours(NamedTuple):
@@ -123,41 +125,64 @@ def mean(cells: Cells, weights: Float[np.ndarray, " columns"] | None = None) -> 
     return jnp.sum(jnp.matmul(cells, columns, precision=lax.Precision.HIGHEST)) / cells.size
 
 
-def pool(frame: Float[Array, "height width"], pooling: int) -> Cells:
+def pool(frame: Frame, pooling: int) -> Cells:
     """Average a frame over the square of each cell.
 
     The number of cells is the one that comes nearest to `pooling` pixels a side. The cells divide the frame evenly,
-    pixels on a border belong to two cells in part, and mirrored frames give mirrored cells.
+    pixels on a border belong to two cells in part, and mirrored frames give mirrored cells. Frames of bytes are summed
+    exactly, so that any compiler gives the same bits.
 
     >>> pool(jnp.arange(8.0).reshape(2, 4), 2).tolist()
     [[2.5, 4.5]]
     """
     if pooling == 1:
-        return frame
-    height, width = frame.shape
-    rows, columns = (max(round(pixels / pooling), 1) for pixels in frame.shape)
-    if height % rows == 0:  # a sum of whole rows, a quarter of the product's time
-        inner = jnp.mean(frame.reshape(rows, height // rows, width), axis=1)
+        return as_float(frame)
+    (rows, row_total), (columns, column_total) = (pooling_parts(size, pooling) for size in frame.shape)
+    if frame.dtype == jnp.uint8:
+        sums = _sum_cells(rows, as_float(frame), columns)
+        # The zero hides a constant: XLA would multiply by its inverse, and in some programs fuse that product with the
+        # difference of two frames, which is then rounded otherwise.
+        return sums / (row_total * column_total + 0 * sums[0, 0])
+    return _sum_cells(rows / row_total, frame, columns / column_total)
+
+
+def pooling_parts(pixels: int, pooling: int) -> tuple[Int[np.ndarray, "cells pixels"], int]:
+    """Return how much of each pixel is in each cell, along one side of the frame, in parts of which a cell has `total`.
+
+    >>> pooling_parts(5, 2)  # the pixel in the middle is in both cells
+    (array([[2, 2, 1, 0, 0],
+           [0, 0, 1, 2, 2]]), 5)
+    """
+    cells = max(round(pixels / pooling), 1)
+    divisor = math.gcd(cells, pixels)
+    total, part = pixels // divisor, cells // divisor
+    cell, pixel = np.arange(cells)[:, None], np.arange(pixels)
+    common = np.minimum((cell + 1) * total, (pixel + 1) * part) - np.maximum(cell * total, pixel * part)
+    return np.maximum(common, 0), total
+
+
+def _sum_cells(rows: np.ndarray, frame: Float[Array, "height width"], columns: np.ndarray) -> Array:
+    """Return the sums over cells, with the weight of every pixel's row and column."""
+    cells, height = rows.shape
+    if height % cells == 0:  # a sum of whole rows, a quarter of the product's time
+        inner = jnp.sum(frame.reshape(cells, height // cells, -1), axis=1) * float(rows[0, 0])
     else:
-        weights = jnp.asarray(_pooling_weights(height, rows), frame.dtype)
-        inner = jnp.matmul(weights, frame, precision=lax.Precision.HIGHEST)
-    weights = jnp.asarray(_pooling_weights(width, columns), frame.dtype)
-    return jnp.matmul(inner, weights.T, precision=lax.Precision.HIGHEST)
+        inner = jnp.matmul(jnp.asarray(rows, frame.dtype), frame, precision=lax.Precision.HIGHEST)
+    return jnp.matmul(inner, jnp.asarray(columns, frame.dtype).T, precision=lax.Precision.HIGHEST)
 
 
-def _pooling_weights(pixels: int, cells: int) -> Float[np.ndarray, "cells pixels"]:
-    """Return the weight of each pixel in each cell, along one side of the frame."""
-    edges = np.arange(cells + 1) * pixels / cells
-    pixel = np.arange(pixels)
-    common = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
-    return np.clip(common, 0.0, None) * cells / pixels
+def as_float(frame: Frame) -> Float[Array, "height width"]:
+    """Return a frame as floats, the grey levels 0..255 of bytes unchanged."""
+    return frame.astype(float) if frame.dtype == jnp.uint8 else frame
 
 
-def require_frame(detector: str, frame: Array) -> None:
-    """Raise `InputError` unless a frame has rows and columns of floats."""
-    if jnp.ndim(frame) != 2 or not jnp.issubdtype(frame.dtype, jnp.floating):
+def require_frame(detector: str, frame: Array, *, takes_bytes: bool = False) -> None:
+    """Raise `InputError` unless a frame has rows and columns of floats, or of bytes where the detector takes them."""
+    is_grey = jnp.issubdtype(frame.dtype, jnp.floating) or (takes_bytes and frame.dtype == jnp.uint8)
+    if jnp.ndim(frame) != 2 or not is_grey:
+        kinds = "floats or uint8" if takes_bytes else "floats"
         raise InputError(
-            f"{detector}: expected a frame of floats, grey 0..255, shape (height, width), got {frame.dtype} "
+            f"{detector}: expected a frame of {kinds}, grey 0..255, shape (height, width), got {frame.dtype} "
             f"{frame.shape}; use frame.astype(float), and vmap for several eyes"
         )
 

@@ -67,6 +67,8 @@ KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
 U_AT_REST = cells.U_AT_REST
 FULL_WEIGHT_BEARING = math.radians(20.0)  # theta_0, up to which all cells have the same weight
 
+"""An image of one eye, grey levels 0..255, in floating point or as a camera delivers it."""
+
 # w_I (eq. 9)
 KERNEL = (
     (0.06, 0.12, 0.25, 0.12, 0.06),
@@ -125,14 +127,14 @@ class Layers:
     summation: Float[Array, "rows columns"]  # S, eq. 11, before the threshold
 
 
-def init(params: Params, frame: Float[Array, "height width"]) -> State:
+def init(params: Params, frame: cells.Frame) -> State:
     """Return the state after a first frame, before any change."""
-    cells.require_frame("lgmd", frame)
+    cells.require_frame("lgmd", frame, takes_bytes=True)
     pooled = pool(params, frame)
     return State(frame=pooled, difference=jnp.zeros_like(pooled))
 
 
-def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
+def step(params: Params, state: State, frame: cells.Frame) -> tuple[State, Response]:
     """Process the next frame (eqs. 7-16).
 
     Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
@@ -157,9 +159,9 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
     return State(frame=pool(params, frame), difference=now.difference), Response(u=u, feed_forward=FF, excitation=U)
 
 
-def layers(params: Params, state: State, frame: Float[Array, "height width"]) -> Layers:
+def layers(params: Params, state: State, frame: cells.Frame) -> Layers:
     """Return the layers of cells for the next frame (eqs. 7-11)."""
-    cells.require_frame("lgmd", frame)
+    cells.require_frame("lgmd", frame, takes_bytes=True)
     pooled = pool(params, frame)
     cells.require_size("lgmd", pooled, state.frame)
     P = pooled - state.frame
@@ -168,8 +170,11 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
     return Layers(difference=P, excitation=E, inhibition=I, summation=E - jnp.abs(I) * params.inhibition)
 
 
-def pool(params: Params, frame: Float[Array, "height width"]) -> Float[Array, "rows columns"]:
+def pool(params: Params, frame: cells.Frame) -> Float[Array, "rows columns"]:
     """Average a frame over the square of each cell (`lgmdjax.detectors.cells.pool`).
+
+    The sums of an 8-bit frame are whole numbers, exact in any order. So all machines and compilers get the same cells,
+    and agree about a cell at the threshold.
 
     >>> pool(Params(pooling=2), jnp.arange(8.0).reshape(2, 4)).tolist()
     [[2.5, 4.5]]
@@ -187,7 +192,7 @@ def inhibit(kernel: Float[Array, "5 5"], difference: Float[Array, "height width"
     """
     height, width = difference.shape
     padded = jnp.pad(difference, KERNEL_RADIUS)
-    quarter = _quarter(kernel).astype(difference.dtype)
+    quarter = kernel_quarter(kernel).astype(difference.dtype)
 
     def row(i: int) -> Array:
         return lax.slice_in_dim(padded, KERNEL_RADIUS + i, KERNEL_RADIUS + i + height, axis=0)
@@ -247,7 +252,7 @@ def _mean_excitation(params: Params, summation: Float[Array, "height width"]) ->
     return _mean(params, jnp.abs(passed))
 
 
-def _quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
+def kernel_quarter(kernel: Float[Array, "5 5"]) -> Float[Array, "3 3"]:
     """Return the weights by distance in rows and columns, averaged over the kernel's four mirror images."""
     w = (kernel + kernel[::-1]) / 2
     return ((w + w[:, ::-1]) / 2)[KERNEL_RADIUS:, KERNEL_RADIUS:]

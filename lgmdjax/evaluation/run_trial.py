@@ -13,7 +13,7 @@ After an interruption the same call continues with the next batch.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import jax
@@ -30,7 +30,6 @@ from lgmdjax.reporting.figures import style, trajectories
 from lgmdjax.runtime import storage
 from lgmdjax.runtime.run_folders import Stage, execute, open_run
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, recording
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena
@@ -91,7 +90,7 @@ def run_trial(
     """
     _check(trial, policy, seeds)
     robot = assembly.load_robot(run / "fit-gait", run / "train") if run else assembly.load_robot()
-    robot = robot if width is None else assembly.with_camera(robot, _scale_camera(robot, width))
+    robot = robot if width is None else assembly.with_camera(robot, assembly.scale_camera(robot, width))
     definition = trials.TRIALS[trial]
     trial_run = describe_run(robot, trial, policy, seeds or definition.seeds, definition.seconds)
 
@@ -108,18 +107,6 @@ def _check(trial: str, policy: str, seeds: int | None) -> None:
             raise InputError(f"expected the name of a {kind}, got {name!r}; choose one of {', '.join(known)}")
     if seeds is not None and seeds < 1:
         raise InputError(f"expected one or more --seeds, got {seeds}; leave it out for as many as the paper has")
-
-
-def _scale_camera(robot: closed_loop.Params, width: int) -> CameraSettings:
-    """Return camera settings with pictures of another width and LGMD cells of the same size in degrees."""
-    camera, pooling = robot.camera, robot.controller.lgmd.pooling
-    if width < 1 or (pooling * width) % camera.width or (camera.height * width) % camera.width:
-        raise InputError(
-            f"expected a --width whose cells are whole pixels as the {pooling} of {camera.width} are, got {width}; "
-            f"try {2 * camera.width}"
-        )
-    height, cell = camera.height * width // camera.width, pooling * width // camera.width
-    return replace(assembly.camera_settings(robot), width=width, height=height, pooling=cell)
 
 
 def describe_run(

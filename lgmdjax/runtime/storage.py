@@ -6,6 +6,7 @@
 | npz                      | the stages                       | `read_arrays`               |
 | safetensors              | `save_tensors`                   | `load_tensors`              |
 | any other                | `replacing`, `replacing_all`     | the module that knows it    |
+| a new folder             | `new_folder`                     | the user                    |
 """
 
 import contextlib
@@ -96,6 +97,38 @@ def _remove_abandoned(partial: Path) -> None:
     lock = FileLock(partial / LOCK_NAME)
     with contextlib.suppress(Timeout, OSError), lock.acquire(timeout=0):
         shutil.rmtree(partial)
+
+
+def require_empty(folder: Path) -> None:
+    """Raise `InputError` unless a folder is empty or missing, so that nothing of the user's is replaced."""
+    if folder.is_dir() and not any(folder.iterdir()):
+        return
+    if folder.exists() or folder.is_symlink():
+        content = "has files" if folder.is_dir() else "is no folder"
+        raise InputError(f"expected an empty or a new folder, got {folder}, which {content}; choose another")
+
+
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `folder`; at the end of the block it becomes `folder`, with all of its files.
+
+    A block that raises leaves nothing. Raises `InputError` for a folder that has files or cannot be made.
+    """
+    require_empty(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        work = tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"expected a folder that can be made, got {folder} ({reason}); choose another") from error
+    with work:
+        whole = Path(work.name, folder.name)
+        whole.mkdir()
+        yield whole
+        require_empty(folder)
+        if folder.exists():
+            folder.rmdir()
+        os.replace(whole, folder)
 
 
 def remove_partial_files(folder: Path) -> None:

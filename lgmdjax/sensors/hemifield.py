@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Shaped
 
 from lgmdjax.errors import InputError
 
@@ -62,7 +62,7 @@ def edges(fov: float, overlap: float) -> tuple[float, float]:
     return 0.5 * fov, fov * (0.5 - overlap)
 
 
-def outermost_first(frames: Float[Array, "2 height columns"]) -> Float[Array, "2 height columns"]:
+def outermost_first(frames: Shaped[Array, "2 height columns"]) -> Shaped[Array, "2 height columns"]:
     """Mirror the picture of the right eye: in both pictures the first column is then that of the largest bearing."""
     return jnp.stack([frames[LEFT], frames[RIGHT, :, ::-1]])
 

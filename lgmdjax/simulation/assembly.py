@@ -121,6 +121,21 @@ def with_camera(params: closed_loop.Params, settings: CameraSettings) -> closed_
     return replace(params, camera=camera_params(settings), controller=replace(params.controller, lgmd=lgmd_params))
 
 
+def scale_camera(robot: closed_loop.Params, width: int) -> CameraSettings:
+    """Return camera settings with pictures of another width and LGMD cells of the same size in degrees.
+
+    Raises InputError for a width at which the cells are not whole pixels.
+    """
+    camera, pooling = robot.camera, robot.controller.lgmd.pooling
+    if width < 1 or (pooling * width) % camera.width or (camera.height * width) % camera.width:
+        raise InputError(
+            f"expected a --width whose cells are whole pixels as the {pooling} of {camera.width} are, got {width}; "
+            f"try {2 * camera.width}"
+        )
+    height, cell = camera.height * width // camera.width, pooling * width // camera.width
+    return replace(camera_settings(robot), width=width, height=height, pooling=cell)
+
+
 def with_policy(params: closed_loop.Params, name: PolicyName, policy_params: PyTree) -> closed_loop.Params:
     """Return the robot with other parameters of one of its five policies.
 

@@ -225,9 +225,8 @@ def observe(
 
     head = pose if params.head_sway is None else hexapod.scale_tilt(pose, params.head_sway)
     frames = render_stereo(params.camera, scene, head, render)
-    started = controller.init_lgmd(params.controller, frames)
-    before = replace(state.controller, lgmd=_where(state.is_first, started, state.controller.lgmd))
-    controller_state, response = controller.detect(params.controller, before, frames)
+    detected = controller.detect_or_start(params.controller, state.controller, frames, state.is_first)
+    controller_state, response = detected
     if params.frame_stride is not None:
         has_picture = state.is_first | (state.frame % params.frame_stride == 0)
         new, old = (controller_state, response), (state.controller, state.response)

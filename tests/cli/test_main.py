@@ -199,6 +199,20 @@ def test_no_trial_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "choose from testing, unseen, tube" in refused(["trial"], capsys)
 
 
+def test_export_lists_its_files_and_replaces_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["export", "pretrained", str(tmp_path / "robot"), "--formats", "c"]
+    assert main.main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines[:3]] == [
+        str(tmp_path / "robot" / name) for name in ("nervous_system.c", "nervous_system.h", "card.json")
+    ]
+    assert lines[3] == "static memory of the C program: 7.0 kB of state, 19.8 kB of constants"
+    assert "empty or a new folder" in refused(command, capsys)
+    assert "lgmdjax train" in refused(["export", str(tmp_path), str(tmp_path / "new"), "--formats", "c"], capsys)
+    assert "choose from onnx, stablehlo, c" in refused([*command[:2], str(tmp_path / "new"), "--formats"], capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["robot"]
+
+
 def test_an_interruption_is_exit_code_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def interrupted(out: Path) -> int:
         raise KeyboardInterrupt
