@@ -1,4 +1,5 @@
 from . import doctor as doctor
+from . import environment as environment
 from . import flags as flags
 from . import main as main
 from . import study as study

@@ -1,19 +1,28 @@
 """The command line: one function for each command, which reads its own flags.
 
-A user's mistake ends in one line on stderr and exit code 2, an interruption in exit code 130. Modules are imported by
+A user's mistake, and an environment in which a library does not start, end in one line on stderr and exit code 2. An
+interruption ends in exit code 130 (Ctrl-C), 143 (SIGTERM) or 129 (SIGHUP), within two seconds. Modules are imported by
 the command that needs them: `lgmdjax --help` loads neither tyro nor JAX, and the help of a command loads no JAX.
 """
 
 import argparse
+import contextlib
+import io
+import os
+import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from inspect import getdoc
 from pathlib import Path
 
 from lgmdjax import __version__
-from lgmdjax.errors import InputError
+from lgmdjax.cli import environment
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import prepare_jax
 
+RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
+MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
 
@@ -52,6 +61,7 @@ def trial(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_trial(_summary(trial), arguments)
+    environment.start_jax()
     from lgmdjax.cli.trial import run_trials
 
     for line in run_trials(given):
@@ -65,6 +75,7 @@ def study(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_study(name, STUDIES[name], arguments[1:])
+    environment.start_jax()
     from lgmdjax.cli.study import run_study
 
     print(f"look into {run_study(name, given)}")
@@ -75,6 +86,7 @@ def watch(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_watch(_summary(watch), arguments)
+    environment.start_jax()
     from lgmdjax.cli.watch import watch_video
 
     for file in watch_video(given):
@@ -122,22 +134,65 @@ STUDIES: Mapping[str, str] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code."""
     given = sys.argv[1:] if arguments is None else list(arguments)
+    return exit_code(lambda: _run(given), RESTARTS if given[:1] in (["watch"], ["doctor"]) else RESUMES)
+
+
+def exit_code(command: Callable[[], int | None], afterwards: str = RESUMES) -> int:
+    """Run a command and return its exit code; print one line on stderr for a mistake of the user.
+
+    Args:
+        command: returns an exit code, or None for 0.
+        afterwards: what the user can do after an interruption.
+    """
+    interrupted = f"lgmdjax: interrupted; {afterwards}"
+    try:
+        with _writable_output(), interruption.obeying(interrupted):
+            return command() or 0
+    except (InputError, OSError) as error:
+        return _complain(f"lgmdjax: {one_line(error)}", 2)
+    except MemoryError as error:
+        return _complain(f"lgmdjax: expected more memory, got {one_line(error) or 'none'}; run fewer robots at once", 2)
+    except KeyboardInterrupt as error:
+        return _complain(interrupted, error.exit_code if isinstance(error, interruption.Interrupted) else 130)
+    except Exception as error:
+        if fault := environment.explain(error):
+            return _complain(f"lgmdjax: {one_line(fault)}", 2)
+        raise
+
+
+def _run(given: Sequence[str]) -> int | None:
+    """Run the command that the arguments name."""
+    columns = shutil.get_terminal_size().columns
+    if not MIN_COLUMNS <= columns <= MAX_COLUMNS:
+        os.environ["COLUMNS"] = str(min(max(columns, MIN_COLUMNS), MAX_COLUMNS))
     summaries = {name: _summary(command) for name, command in COMMANDS.items()}
     name = _choose("lgmdjax", "COMMAND", DESCRIPTION, summaries, given[:1])
     prepare_jax()
-    return exit_code(lambda: COMMANDS[name](given[1:]))
+    return COMMANDS[name](given[1:])
 
 
-def exit_code(command: Callable[[], int | None]) -> int:
-    """Run a command and return its exit code; print one line on stderr for a mistake of the user."""
+@contextlib.contextmanager
+def _writable_output() -> Iterator[None]:
+    """Let every text be printed, whatever the encoding; raise `OSError` at the end if output cannot be written."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
-        return command() or 0
-    except (InputError, OSError) as error:
-        print(f"lgmdjax: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("lgmdjax: interrupted; the same command resumes", file=sys.stderr)
-        return 130
+        yield
+    finally:
+        try:
+            sys.stdout.flush()
+        except OSError:
+            with contextlib.suppress(OSError):  # what is left to print must not fail again when Python ends
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise
+
+
+def _complain(line: str, code: int) -> int:
+    """Print a line on stderr, if anybody can read it, and return an exit code."""
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+    return code
 
 
 def _choose(program: str, noun: str, description: str, choices: Mapping[str, str], word: Sequence[str]) -> str:
@@ -170,6 +225,7 @@ def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequen
 
     name = command.__name__.replace("_", "-")
     given = flags.parse_pipeline(name, _summary(command), arguments)
+    environment.start_jax()
     from lgmdjax.runtime.run_folders import execute, open_run
 
     run = open_run(given.out, given.name, given.scale, given.seed, given.settings)
