@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from inspect import getdoc
 from pathlib import Path
+from typing import IO
 
 from lgmdjax import __version__
 from lgmdjax.cli import environment
@@ -195,11 +196,18 @@ def _complain(line: str, code: int) -> int:
     return code
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that does not hide that its help could not be printed."""
+
+    def _print_message(self, message: str, file: IO[str] | None = None) -> None:
+        (file or sys.stderr).write(message or "")
+
+
 def _choose(program: str, noun: str, description: str, choices: Mapping[str, str], word: Sequence[str]) -> str:
     """Return the choice that a word names; exit with help or an error if there is no such word."""
     column = max(map(len, choices))
     listed = "\n".join(f"  {name:{column}}  {summary}" for name, summary in choices.items())
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=program,
         usage=f"{program} {noun} [flags]",
         description=description,

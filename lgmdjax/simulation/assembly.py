@@ -64,6 +64,8 @@ def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAIN
     arrays = read_arrays(baselines)
     schema.check(BASELINES, arrays, str(baselines), "train again")
     switch = make_policies(navigator_params, float(arrays["gain"]), arrays["replayed"])
+    smallest = min(header["eyes"]["width"], header["eyes"]["height"])
+    schema.check(schema.Integer(1, smallest), header["eyes"].get("pooling", 1), f"{controller}: pooling", "train again")
     eyes = {name: header["eyes"][name] for name in (*EYES.fields, *EYES.optional) if name in header["eyes"]}
     return assemble_robot(gait_folder, CameraSettings(**eyes), _lgmd_params(header["lgmd"]), switch)
 
