@@ -22,8 +22,9 @@ from lgmdjax.simulation import assembly, episodes
 
 CASES = int(os.environ.get("LGMDJAX_TEST_DAMAGE", "200"))
 
+FACTS = ("format", "scale", "seed", "settings", "versions")  # of run.json; a damaged name of its checksum is no fact
 READERS: dict[str, Callable[[Path], object]] = {
-    "run.json": lambda run: {k: v for k, v in run_folders.read_facts(run).items() if k != checksums.SEAL},
+    "run.json": lambda run: {key: run_folders.read_facts(run)[key] for key in FACTS},
     "fit-gait/shaping.safetensors": lambda run: assembly.shaping.load(run / "fit-gait" / "shaping.safetensors"),
     "train/controller.safetensors": lambda run: assembly.navigator.load(run / "train" / "controller.safetensors"),
     "train/baselines.npz": lambda run: storage.read_arrays(run / "train" / "baselines.npz"),

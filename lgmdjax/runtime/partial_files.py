@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from lgmdjax.errors import InputError
 from lgmdjax.runtime import checksums
@@ -95,10 +95,10 @@ def _lock_of(folder: Path) -> Path:
 
 
 def _remove_abandoned_folders(folder: Path) -> None:
-    """Remove the temporary folders of processes that were killed: the operating system released their locks."""
+    """Remove the temporary folders of killed processes, whose locks the operating system released."""
     for work in [*folder.glob(".partial-*")]:
         lock = work if work.suffix == ".lock" else _lock_of(work)
-        with contextlib.suppress(Timeout), FileLock(lock).acquire(blocking=False):
+        with contextlib.suppress(OSError), FileLock(lock).acquire(blocking=False):
             shutil.rmtree(lock.with_suffix(""), ignore_errors=True)
             lock.unlink(missing_ok=True)
 

@@ -31,9 +31,10 @@ class Number:
 
     def accepts(self, value: object) -> bool:
         """Tell whether a value is such a number."""
-        value = value.item() if isinstance(value, np.generic) else value
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return is_number and self.low <= value <= self.high
+        number = value.item() if isinstance(value, np.generic) else value
+        if not isinstance(number, (int, float)) or isinstance(number, bool):
+            return False
+        return self.low <= number <= self.high
 
 
 @dataclass(frozen=True)

@@ -161,4 +161,5 @@ def load_detector(folder: Path) -> lgmd.Params:
 
 
 def _lgmd_params(constants: JsonObject) -> lgmd.Params:
-    return lgmd.Params(**{name: float(constants[name]) for name in CALIBRATED})
+    threshold, suppression, inhibition = (float(constants[name]) for name in CALIBRATED)
+    return lgmd.Params(threshold=threshold, suppression=suppression, inhibition=inhibition)

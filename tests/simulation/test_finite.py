@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
 
+from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import metrics, trials
-from lgmdjax.simulation import finite
+from lgmdjax.simulation import finite, rollout
 from lgmdjax.simulation.closed_loop import Record
 
 
@@ -54,3 +56,24 @@ def test_a_lost_robot_does_not_make_scores_nan() -> None:
     ok[1, 3:] = False
     score = metrics.score(replace(record, ok=ok))
     assert score.lost == 1 and np.isfinite([score.clearance.value, score.distance, score.turning]).all()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_rollout_flags_what_is_not_finite(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollout, "reset_batch", lambda *_, **__: None)
+    monkeypatch.setattr(rollout, "rollout_batch", lambda *_, **__: (None, damaged("u", np.nan)))
+    chunks = list(rollout.rollout_chunks(None, None, None, None, 3.0, chunk_seconds=2.0))  # pyright: ignore
+    assert [chunk.ok[1, 3] for chunk in chunks] == [False, False]
+    assert all(np.isfinite(chunk.u).all() and chunk.ok[0].all() for chunk in chunks)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_detector_does_not_hide_a_pixel_that_is_not_finite(value: float) -> None:
+    """In the frame with the pixel all outputs but FF, which is a frame late, are nan; a frame later FF too."""
+    params = lgmd.Params(threshold=2.0)
+    image = jnp.full((8, 8), 100.0)
+    state = lgmd.init(params, image)
+    state, response = lgmd.step(params, state, image.at[3, 3].set(value))
+    assert not np.isfinite(response.excitation) and (np.isnan(response.u) or np.isinf(value))
+    _, response = lgmd.step(params, state, image)
+    assert np.isnan(response.u) and not np.isfinite(response.feed_forward)
