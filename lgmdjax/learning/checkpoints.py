@@ -35,7 +35,8 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path | str, identity: JsonObject):
-        logging.getLogger("absl").setLevel(logging.ERROR)  # orbax logs a line for every file
+        for name in ("absl", "asyncio"):  # orbax logs a line for every file, and errors that it raises as well
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self.folder, self.identity = Path(folder).absolute(), json.loads(json.dumps(identity))
         options = ocp.CheckpointManagerOptions(max_to_keep=1, create=True, enable_async_checkpointing=False)
         try:
@@ -89,7 +90,10 @@ class Checkpoints:
 
     def close(self) -> None:
         """Close the folder."""
-        self.manager.close()
+        try:
+            self.manager.close()
+        except Exception as error:
+            raise InputError(f"{self.folder}: expected to write, got {_first_line(error)}; free some disk") from error
 
     def _require_same_identity(self, found: JsonObject) -> None:
         # A name that only one of both has belongs to another version of the package.

@@ -6,10 +6,16 @@ This module does not import them, so that a program can call `prepare_jax` first
 import os
 from pathlib import Path
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 from lgmdjax.errors import InputError, one_line
 
 PREFIXES = ("JAX_", "XLA_", "CUDA_", "TF_CPP_", "MUJOCO_", "MPL", "PYOPENGL_")
 """Of the variables that decide how libraries start."""
+MIN_MEMORY = 2e9  # bytes of address space; with less, XLA ends the process when it starts its threads
 COUNT = "JAX_NUM_CPU_DEVICES"
 
 
@@ -29,10 +35,14 @@ def prepare_jax() -> None:
 
 
 def check_variables() -> None:
-    """Raise `InputError` for a variable that JAX would stop at without naming it."""
+    """Raise `InputError` for a variable or a limit of memory that JAX would stop at without naming it."""
     count = os.environ.get(COUNT, "1")
     if not (count.isascii() and count.isdigit() and 0 < int(count) <= 1024):
         raise InputError(f"expected {COUNT} of 1 to 1024, got {count!r}; unset it for one device on each core")
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0] if resource is not None else -1
+    if 0 <= limit < MIN_MEMORY:
+        gigabytes = f"expected {MIN_MEMORY / 1e9:g} GB of memory or more, got a limit of {limit / 1e9:.2g} GB"
+        raise InputError(f"{gigabytes}; raise it (ulimit -v)")
 
 
 def user_variables() -> str:

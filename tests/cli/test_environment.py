@@ -52,6 +52,14 @@ def test_an_impossible_number_of_devices_is_named(value: str, monkeypatch: pytes
         environment.start_jax()
 
 
+def test_a_limit_of_memory_in_which_xla_would_end_the_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    if jax_setup.resource is None:
+        pytest.skip("there are no such limits")
+    monkeypatch.setattr(jax_setup.resource, "getrlimit", lambda _: (10**9, -1))
+    with pytest.raises(InputError, match="expected 2 GB of memory or more, got a limit of 1 GB"):
+        environment.start_jax()
+
+
 def test_a_fault_of_the_program_is_no_fault_of_the_environment() -> None:
     assert environment.explain(ZeroDivisionError()) == ""
     assert "more memory" in environment.explain(type("JaxRuntimeError", (Exception,), {})("RESOURCE_EXHAUSTED: 8 GB"))
