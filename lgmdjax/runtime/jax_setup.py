@@ -46,12 +46,7 @@ def check_variables() -> None:
 
 
 def user_variables() -> str:
-    """Return the variables that the user has set, and that decide how libraries start, as one text; it may be empty.
-
-    >>> os.environ["MUJOCO_GL"] = "osmesa"
-    >>> "MUJOCO_GL='osmesa'" in user_variables()
-    True
-    """
+    """Return the variables that the user has set, and that decide how libraries start, as one text; it may be empty."""
     names = sorted(name for name in os.environ if name.startswith(PREFIXES) and os.environ[name] != _DEFAULTS.get(name))
     return one_line(", ".join(f"{name}={os.environ[name]!r}" for name in names))
 
