@@ -40,7 +40,7 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
 def test_a_variable_that_a_library_does_not_understand_is_named(
     name: str, value: str, library: str, tmp_path: Path
 ) -> None:
-    done = command("trial", "corner", "--seeds", "1", "--out", str(tmp_path / "new"), **{name: value})
+    done = command("trial", "corner", "--seeds", "1", "--out", str(tmp_path / "new"), **{name: value})  # pyright: ignore[reportArgumentType]
     refused(done, f"expected an environment in which {library} starts", f"{name}='{value}'")
     assert not (tmp_path / "new").exists()
 
@@ -79,7 +79,7 @@ def test_a_user_without_a_home_folder_has_no_cache(monkeypatch: pytest.MonkeyPat
 
 def test_help_is_printed_in_any_terminal() -> None:
     for variables in ({"COLUMNS": "1"}, {"COLUMNS": "1000000000"}, {"PYTHONIOENCODING": "ascii"}):
-        done = command("trial", "--help", **variables)
+        done = command("trial", "--help", **variables)  # pyright: ignore[reportArgumentType]
         assert done.returncode == 0 and "--policy" in done.stdout, done.stderr
 
 
