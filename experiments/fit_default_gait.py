@@ -8,7 +8,8 @@ from tqdm import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.locomotion import gait_fit, kinematics, shaping
-from lgmdjax.paths import SHAPING_FILE
+from lgmdjax.paths import DATA_DIR, SHAPING_FILE
+from lgmdjax.runtime.storage import write_stamp
 
 STEPS = 6000  # of the optimiser
 SEED = 1
@@ -26,6 +27,7 @@ def main() -> None:
             kinematics.read_geometry(hexapod.load()), key=jax.random.key(SEED), steps=STEPS, progress=show
         )
     shaping.save(SHAPING_FILE, networks, {"steps": STEPS, "seed": SEED})
+    write_stamp(DATA_DIR, {})
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import tyro
 
 from lgmdjax.cli.main import exit_code
 from lgmdjax.errors import InputError
+from lgmdjax.runtime import checksums
 from lgmdjax.runtime.storage import read_json, write_json
 
 WALKS = ("*.parquet", "walk.npz", "trajectories.npz", "walks", "episodes")
@@ -39,7 +40,8 @@ def main(run: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], figur
     for record in copy.glob("*/done.json"):
         facts = json.loads(record.read_text(encoding="utf-8"))
         files = {name: size for name, size in facts["files"].items() if (record.parent / name).is_file()}
-        write_json(record, facts | {"files": files})
+        was_sealed = facts.pop(checksums.SEAL, None) is not None  # those of older versions are not
+        write_json(record, checksums.seal(facts | {"files": files}) if was_sealed else facts | {"files": files})
     for folder in sorted(copy.rglob("*"), reverse=True):
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()

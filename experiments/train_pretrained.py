@@ -10,7 +10,8 @@ import sys
 from pathlib import Path
 
 from lgmdjax.cli.main import main
-from lgmdjax.paths import PRETRAINED_DIR
+from lgmdjax.paths import DATA_DIR, PRETRAINED_DIR
+from lgmdjax.runtime.storage import write_stamp
 
 SCALE, SEED, OUT = "paper", 2026, Path("runs")
 FILES = ("fit-gait/shaping.safetensors", "train/controller.safetensors", "train/baselines.npz")
@@ -22,6 +23,7 @@ def train_pretrained() -> int:
     if code == 0:
         for file in FILES:
             shutil.copy(OUT / f"{SCALE}-{SEED}" / file, PRETRAINED_DIR)
+        write_stamp(DATA_DIR, {})
     return code
 
 

@@ -3,3 +3,13 @@
 
 class InputError(ValueError):
     """Invalid input from the user; the message is one line: what was expected, what was given, and what to do."""
+
+
+def one_line(text: object) -> str:
+    r"""Return a text as one line without control characters, which a terminal would obey; they are escaped.
+
+    >>> one_line("a\n  b \x1b[2J")
+    'a b \\x1b[2J'
+    """
+    words = " ".join(str(text).split())
+    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in words)

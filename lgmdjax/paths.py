@@ -5,10 +5,13 @@ from pathlib import Path
 PACKAGE_DIR = Path(__file__).resolve().parent
 """The root of the package. The hash of its files identifies cached programs."""
 
-SHAPING_FILE = PACKAGE_DIR / "data" / "shaping.safetensors"
+DATA_DIR = PACKAGE_DIR / "data"
+"""Weights of the package, and done.json with their checksums."""
+
+SHAPING_FILE = DATA_DIR / "shaping.safetensors"
 """Weights of the default shaping networks (`experiments/fit_default_gait.py`)."""
 
-PRETRAINED_DIR = PACKAGE_DIR / "data" / "trained"
+PRETRAINED_DIR = DATA_DIR / "trained"
 """Gait and controller of the pretrained robot. Both come from one run, in which the controller was trained with this
 gait."""
 

@@ -1,5 +1,6 @@
 from . import bench as bench
 from . import doctor as doctor
+from . import environment as environment
 from . import export as export
 from . import flags as flags
 from . import main as main

@@ -13,6 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from packaging.requirements import Requirement
 
+from lgmdjax.cli import environment
+from lgmdjax.errors import one_line
+from lgmdjax.runtime import jax_setup
+
 OK, WARN, FAIL = "OK", "WARN", "FAIL"
 CANARY_ROWS = 32_769  # smallest batch that shows jax#39103: one more than a multiple of the tile
 STEP_TOLERANCE = 1e-4  # largest difference of MJX and C MuJoCo in any coordinate after one step in float64
@@ -36,6 +40,7 @@ def run_checks(out: Path) -> int:
     checks: dict[str, Callable[[], Finding]] = {
         "python": python,
         "packages": packages,
+        "environment": variables,
         "devices": devices,
         "arithmetic": arithmetic,
         "physics": physics,
@@ -48,8 +53,8 @@ def run_checks(out: Path) -> int:
         try:
             finding = check()
         except Exception as error:  # whatever else goes wrong on this machine is a finding too
-            finding = Finding(FAIL, f"{type(error).__name__}: {' '.join(str(error).split())[:300]}")
-        print(f"{finding.level:4}  {name:10}  {finding.text}", flush=True)
+            finding = Finding(FAIL, _describe(error))
+        print(f"{finding.level:4}  {name:11}  {one_line(finding.text)}", flush=True)
         failed |= finding.level == FAIL
     return int(failed)
 
@@ -89,6 +94,12 @@ def packages() -> Finding:
     if wrong:
         return Finding(FAIL, f"{', '.join(wrong)}; install from requirements.lock")
     return Finding(OK, ", ".join(accepted))
+
+
+def variables() -> Finding:
+    """Start the libraries that read environment variables, and name those that are set."""
+    environment.check()
+    return Finding(OK, jax_setup.user_variables() or "no variable of JAX, MuJoCo or Matplotlib is set")
 
 
 def devices() -> Finding:
@@ -184,6 +195,13 @@ def folder(out: Path) -> Finding:
         return Finding(
             FAIL, f"expected a folder that can be written, got {parent} ({error.strerror}); choose another --out"
         )
+
+
+def _describe(error: Exception) -> str:
+    """Return what an error says, and the environment variables that may be its cause."""
+    named = jax_setup.user_variables()
+    text = f"{type(error).__name__}: {one_line(error)[:300]}"
+    return f"{text} (set: {named})" if named and named not in text else text
 
 
 def _existing_parent(path: Path) -> Path:

@@ -195,6 +195,11 @@ def parse_study(study: str, question: str, arguments: Sequence[str]) -> StudyFla
 
 def parse(flags: FlagsT, command: str, description: str, arguments: Sequence[str]) -> FlagsT:
     """Read flags; those that are not given keep the values of `flags`."""
+    for before, argument in zip(("", *arguments), arguments, strict=False):
+        flag, equals, value = argument.partition("=")
+        if not (value if equals else argument) and "--name" not in (before, flag):
+            named = flag if equals else before or "the first argument"
+            raise InputError(f"expected a value for {named}, got an empty one; leave it out, or give a path")
     return tyro.cli(
         type(flags),
         default=flags,

@@ -1,25 +1,31 @@
 """The command line: one function for each command, which reads its own flags.
 
-A user's mistake ends in one line on stderr and exit code 2, a signal in exit code 128 plus its number (130 for Ctrl-C).
-Modules are imported by the command that needs them: `lgmdjax --help` loads neither tyro nor JAX, and the help of a
-command loads no JAX.
+A user's mistake, and an environment in which a library does not start, end in one line on stderr and exit code 2. An
+interruption ends in exit code 130 (Ctrl-C), 143 (SIGTERM) or 129 (SIGHUP), within two seconds. Modules are imported by
+the command that needs them: `lgmdjax --help` loads neither tyro nor JAX, and the help of a command loads no JAX.
 """
 
 import argparse
 import codecs
 import contextlib
 import io
-import signal
+import os
+import shutil
 import sys
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from inspect import getdoc
 from pathlib import Path
+from typing import IO
 
 from lgmdjax import __version__
-from lgmdjax.errors import InputError
+from lgmdjax.cli import environment
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import prepare_jax
 
+RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
+NOT_RESUMED = ("watch", "export", "bench", "doctor")
+MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
 
@@ -58,6 +64,7 @@ def trial(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_trial(_summary(trial), arguments)
+    environment.start_jax()
     from lgmdjax.cli.trial import run_trials
 
     for line in run_trials(given):
@@ -71,20 +78,10 @@ def study(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_study(name, STUDIES[name], arguments[1:])
+    environment.start_jax()
     from lgmdjax.cli.study import run_study
 
     print(f"look into {run_study(name, given)}")
-
-
-def export(arguments: Sequence[str]) -> None:
-    """Write a robot's nervous system as ONNX, StableHLO and C99, to run it without this package."""
-    from lgmdjax.cli import flags
-
-    given = flags.parse_export(_summary(export), arguments)
-    from lgmdjax.cli.export import export_robot
-
-    for line in export_robot(given):
-        print(line)
 
 
 def watch(arguments: Sequence[str]) -> None:
@@ -92,10 +89,23 @@ def watch(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_watch(_summary(watch), arguments)
+    environment.start_jax()
     from lgmdjax.cli.watch import watch_video
 
     for file in watch_video(given):
         print(file)
+
+
+def export(arguments: Sequence[str]) -> None:
+    """Write a robot's nervous system as ONNX, StableHLO and C99, to run it without this package."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse_export(_summary(export), arguments)
+    environment.start_jax()
+    from lgmdjax.cli.export import export_robot
+
+    for line in export_robot(given):
+        print(line)
 
 
 def bench(arguments: Sequence[str]) -> None:
@@ -103,6 +113,7 @@ def bench(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_bench(_summary(bench), arguments)
+    environment.start_jax()
     from lgmdjax.cli.bench import run_bench
 
     for line in run_bench(given):
@@ -129,13 +140,10 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "trial": trial,
     "study": study,
     "watch": watch,
-    "bench": bench,
     "export": export,
+    "bench": bench,
     "doctor": doctor,
 }
-
-NOT_RESUMED = ("watch", "doctor")
-"""Commands that begin anew after an interruption."""
 
 STUDIES: Mapping[str, str] = {
     "velocity": "How fast should the robot walk for its detectors? (fig. 9)",
@@ -155,71 +163,90 @@ STUDIES: Mapping[str, str] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code."""
     given = sys.argv[1:] if arguments is None else list(arguments)
+    return exit_code(lambda: _run(given), RESTARTS if given[:1] and given[0] in NOT_RESUMED else RESUMES)
+
+
+def exit_code(command: Callable[[], int | None], afterwards: str = RESUMES) -> int:
+    """Run a command and return its exit code; print one line on stderr for a mistake of the user.
+
+    Args:
+        command: returns an exit code, or None for 0.
+        afterwards: what the user can do after an interruption.
+    """
+    interrupted = f"lgmdjax: interrupted; {afterwards}"
+    try:
+        with _writable_output(), interruption.obeying(interrupted):
+            return command() or 0
+    except (InputError, OSError) as error:
+        return _complain(f"lgmdjax: {one_line(error)}", 2)
+    except MemoryError as error:
+        return _complain(f"lgmdjax: expected more memory, got {one_line(error) or 'none'}; run fewer robots at once", 2)
+    except KeyboardInterrupt as error:
+        return _complain(interrupted, error.exit_code if isinstance(error, interruption.Interrupted) else 130)
+    except Exception as error:
+        if fault := environment.explain(error):
+            return _complain(f"lgmdjax: {one_line(fault)}", 2)
+        raise
+
+
+def _run(given: Sequence[str]) -> int | None:
+    """Run the command that the arguments name."""
+    columns = shutil.get_terminal_size().columns
+    if not MIN_COLUMNS <= columns <= MAX_COLUMNS:
+        os.environ["COLUMNS"] = str(min(max(columns, MIN_COLUMNS), MAX_COLUMNS))
     summaries = {name: _summary(command) for name, command in COMMANDS.items()}
     name = _choose("lgmdjax", "COMMAND", DESCRIPTION, summaries, given[:1])
     prepare_jax()
-    _print_any_name()
-    with _stopping_at_signals():
-        return exit_code(lambda: COMMANDS[name](given[1:]), name)
-
-
-def exit_code(command: Callable[[], int | None], name: str = "") -> int:
-    """Run a command and return its exit code; print one line on stderr for a mistake of the user."""
-    try:
-        return command() or 0
-    except (InputError, OSError) as error:
-        print(f"lgmdjax: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt as interruption:
-        number = interruption.args[0] if interruption.args else signal.SIGINT
-        then = "starts anew, and nothing was written" if name in NOT_RESUMED else "resumes"
-        print(f"lgmdjax: interrupted by {signal.Signals(number).name}; the same command {then}", file=sys.stderr)
-        return 128 + number
+    return COMMANDS[name](given[1:])
 
 
 @contextlib.contextmanager
-def _stopping_at_signals() -> Iterator[None]:
-    """End the block at SIGTERM and SIGHUP as at Ctrl-C: what is unfinished is removed.
+def _writable_output() -> Iterator[None]:
+    """Let every text be printed, whatever the encoding; raise `OSError` at the end if output cannot be written.
 
-    Under nohup, SIGHUP stays ignored. Signals reach the main thread alone.
+    Names of files that are not text in the encoding of stdout are printed byte by byte as they are.
     """
-
-    def stop(number: int, _: object) -> None:
-        raise KeyboardInterrupt(number)
-
-    handled = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    if threading.current_thread() is not threading.main_thread():
-        handled = []
-    before = {number: signal.getsignal(number) for number in handled}
-    replaced = [number for number, handler in before.items() if handler == signal.SIG_DFL]
-    for number in replaced:
-        signal.signal(number, stop)
+    codecs.register_error("lgmdjax-names", _replace_by_bytes)
+    for stream, errors in ((sys.stdout, "lgmdjax-names"), (sys.stderr, "backslashreplace")):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=errors)
     try:
         yield
     finally:
-        for number in replaced:
-            signal.signal(number, before[number])
-
-
-def _print_any_name() -> None:
-    """Let stdout print the names of files that are not text in its encoding, byte by byte as they are."""
-
-    def replace(error: UnicodeError) -> tuple[str | bytes, int]:
         try:
-            return codecs.lookup_error("surrogateescape")(error)
-        except UnicodeError:
-            return codecs.backslashreplace_errors(error)
+            sys.stdout.flush()
+        except OSError:
+            with contextlib.suppress(OSError):  # what is left to print must not fail again when Python ends
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise
 
-    codecs.register_error("lgmdjax-names", replace)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="lgmdjax-names")
+
+def _replace_by_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
+    try:
+        return codecs.lookup_error("surrogateescape")(error)
+    except UnicodeError:
+        return codecs.backslashreplace_errors(error)
+
+
+def _complain(line: str, code: int) -> int:
+    """Print a line on stderr, if anybody can read it, and return an exit code."""
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+    return code
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that does not hide that its help could not be printed."""
+
+    def _print_message(self, message: str, file: IO[str] | None = None) -> None:
+        (file or sys.stderr).write(message or "")
 
 
 def _choose(program: str, noun: str, description: str, choices: Mapping[str, str], word: Sequence[str]) -> str:
     """Return the choice that a word names; exit with help or an error if there is no such word."""
     column = max(map(len, choices))
     listed = "\n".join(f"  {name:{column}}  {summary}" for name, summary in choices.items())
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=program,
         usage=f"{program} {noun} [flags]",
         description=description,
@@ -245,6 +272,7 @@ def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequen
 
     name = command.__name__.replace("_", "-")
     given = flags.parse_pipeline(name, _summary(command), arguments)
+    environment.start_jax()
     from lgmdjax.runtime.run_folders import execute, open_run
 
     run = open_run(given.out, given.name, given.scale, given.seed, given.settings)

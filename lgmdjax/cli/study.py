@@ -55,7 +55,7 @@ def run_study(name: str, flags: StudyFlags) -> Path:
 
     def work(folder: Path, _: Mapping[str, Path], settings: object, seed: int) -> None:
         MODULES[name].run(folder, inputs, settings, seed)
-        rows = storage.read_json(folder / f"{name}.json")
+        rows = storage.read_table(folder / f"{name}.json")
         (folder / f"{name}.png").write_bytes(style.to_png(MODULES[name].plot(rows)))
 
     facts = {name: flags.settings, "robot": assembly.fingerprint(robot)}

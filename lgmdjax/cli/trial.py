@@ -15,7 +15,7 @@ def run_trials(flags: TrialFlags) -> Iterator[str]:
             folder = run_trial.run_trial(
                 trial, policy, seed=flags.seed, seeds=flags.seeds, width=flags.width, run=flags.run, out=flags.out
             )
-            yield f"{trial}, {policy}: {describe(storage.read_json(folder / 'outcome.json'))}; look into {folder}"
+            yield f"{trial}, {policy}: {describe(storage.read_table(folder / 'outcome.json'))}; look into {folder}"
 
 
 def describe(outcome: JsonObject) -> str:

@@ -44,7 +44,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lgmdjax.control import lstm
 from lgmdjax.control.names import VARIANTS, Variant
 from lgmdjax.errors import InputError
-from lgmdjax.runtime import storage, versions
+from lgmdjax.runtime import schema, storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
 UNITS = 32
@@ -52,6 +52,8 @@ FILE = storage.TensorFile(
     format="lgmdjax navigator", version="2", name="a navigator", remedy="`lgmdjax train` makes one"
 )
 RECURRENT = ("lstm", "lstm-efference")
+HEADER = schema.Object({"variant": schema.Text(VARIANTS), "units": schema.Integer(1, 4096), "symmetric": schema.Flag()})
+SCALE = schema.Numbers((2,), 1e-6, storage.MAX_WEIGHT)  # inputs are divided by one
 SCALES = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 
@@ -176,13 +178,13 @@ def save(path: Path | str, params: Params, metadata: JsonObject | None = None) -
 def load(path: Path | str) -> tuple[Params, JsonObject]:
     """Read a navigator that `save` wrote, and its metadata; raise `InputError` for any other file."""
     tensors, metadata = storage.load_tensors(path, FILE)
-    try:
-        variant, units, symmetric = (metadata[name] for name in ("variant", "units", "symmetric"))
-    except KeyError as error:
-        raise InputError(f"{path}: expected a header that names {error}, got none; {FILE.remedy}") from error
+    schema.check(HEADER, metadata, f"{path}: header", FILE.remedy)
+    variant, units, symmetric = (metadata[name] for name in HEADER.fields)
     template = jax.eval_shape(lambda: create(jax.random.key(0), variant, units, symmetric=symmetric))
     shapes = {name: value.shape for name, value in _tensors(template).items()}
-    storage.check_shapes(path, tensors, FILE, shapes)
+    storage.check_weights(path, tensors, FILE, shapes)
+    for name in ("input_scale", "output_scale"):
+        schema.check(SCALE, tensors[name], f"{path}: {name}", FILE.remedy)
     return _with_tensors(template, tensors), metadata
 
 

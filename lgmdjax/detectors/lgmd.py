@@ -110,7 +110,7 @@ class State:
 
 @struct.dataclass(kw_only=True)
 class Response:
-    """Response of the detector to one frame."""
+    """Response of the detector to one frame; nan if a pixel of this frame or of the last two is not finite."""
 
     u: Float[Array, ""]  # eqs. 14, 16
     feed_forward: Float[Array, ""]  # FF, eq. 15 [grey]
@@ -248,7 +248,8 @@ def _mean_excitation(params: Params, summation: Float[Array, "height width"]) ->
     """Return the mean over the cells of what exceeds T_s (eqs. 12, 13, and the division of eq. 14) [grey]."""
     S, margin = summation, summation - params.threshold
     sigmoid = params.smooth
-    passed = S * jax.nn.sigmoid(margin / params.threshold_width) if sigmoid else jnp.where(margin >= 0, S, 0.0)
+    # A pixel that is not a number has to show: `margin >= 0` would count it as no excitation.
+    passed = S * jax.nn.sigmoid(margin / params.threshold_width) if sigmoid else jnp.where(margin < 0, 0.0, S)
     return _mean(params, jnp.abs(passed))
 
 

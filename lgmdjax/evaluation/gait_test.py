@@ -23,6 +23,7 @@ from numpy import ndarray
 
 from lgmdjax import geometry
 from lgmdjax.body import hexapod
+from lgmdjax.errors import InputError
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import rollout
@@ -101,8 +102,19 @@ def simulate_mujoco(model: mujoco.MjModel, targets: Float[Array, "steps 6 3"]) -
     return _to_trajectory(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
+def require_duration(seconds: float, cycle_time: float) -> None:
+    """Raise `InputError` for walks that are shorter than the settling time and one gait cycle [s]."""
+    least = SETTLING_TIME + cycle_time + TIME_STEP
+    if seconds < least - 1e-9:
+        raise InputError(f"expected walks of {least:.2f} s or more to measure a gait, got {seconds:g} s; walk longer")
+
+
 def measure_gait(trajectory: GaitTrajectory, cycle_time: float) -> GaitMetrics:
-    """Measure speed, turning and sway over whole gait cycles [s] after the settling time."""
+    """Measure speed, turning and sway over whole gait cycles [s] after the settling time.
+
+    Raises InputError if the walk has no whole cycle after it.
+    """
+    require_duration(len(trajectory.position) * TIME_STEP, cycle_time)
     first, cycle = round(SETTLING_TIME / TIME_STEP), cycle_time / TIME_STEP
     last = first + round(int((len(trajectory.position) - 1 - first) / cycle) * cycle)
     roll, pitch, yaw = (np.unwrap(angle)[first : last + 1] for angle in _euler_angles(trajectory.quaternion))

@@ -33,6 +33,7 @@ from scipy import ndimage, stats
 from lgmdjax import geometry
 from lgmdjax.errors import InputError
 from lgmdjax.locomotion import cpg
+from lgmdjax.simulation import finite
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
 
 CONFIDENCE = 0.95
@@ -91,8 +92,9 @@ def score(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Score:
         record: recorded walks, axes (robot, frame).
         cycle_time: duration of one gait cycle [s], over which paths and headings are averaged.
 
-    Raises InputError if no robot moved.
+    Raises InputError if no robot moved, or if a frame that counts is not finite.
     """
+    record = finite.require_finite(record, "metrics")
     ok = np.asarray(record.ok)
     contacts = np.asarray(record.contact) & ok
     steps = step_lengths(record, cycle_time)
@@ -121,8 +123,9 @@ def progress(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Progress:
         record: recorded walks, axes (robot, frame).
         cycle_time: duration of one gait cycle [s], over which paths and headings are averaged.
 
-    Raises InputError if no frame counts.
+    Raises InputError if no frame counts, or one that does is not finite.
     """
+    record = finite.require_finite(record, "metrics")
     ok = np.asarray(record.ok)
     frames = ok.sum(axis=1)
     if not frames.any():

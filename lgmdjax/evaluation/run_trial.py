@@ -97,7 +97,9 @@ def run_trial(
     def work(folder: Path, inputs: Mapping[str, Path], settings: JsonObject, seed: int) -> None:
         _write_results(folder, trial_run, robot, seed)
 
-    place = open_run(out, f"{trial}-{policy}-{seed}", "trial", seed, {"trial": trial_run.parameters()})
+    settings = {"trial": trial_run.parameters()}
+    name, remedy = f"{trial}-{policy}-{seed}", "choose another --out or --seed"
+    place = open_run(out, name, "trial", seed, settings, remedy=remedy)
     return execute(place, (Stage(name="trial", run=work),), "trial")
 
 

@@ -32,7 +32,7 @@ from numpy import ndarray
 from lgmdjax import geometry
 from lgmdjax.evaluation.metrics import Estimate, wilson_proportion
 from lgmdjax.evaluation.settings import TrialName
-from lgmdjax.simulation import room_batches
+from lgmdjax.simulation import finite, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena, scenes
 
@@ -82,7 +82,11 @@ class Outcome:
 
 
 def find_outcome(trial: Trial, record: Record) -> Outcome:
-    """Find when each robot's trial ended and what happened until then; the record has axes (robot, frame)."""
+    """Find when each robot's trial ended and what happened until then; the record has axes (robot, frame).
+
+    Raises InputError if a frame that is ok is not finite.
+    """
+    record = finite.require_finite(record, "trial")
     x = np.asarray(record.position)[..., 0]
     heading = np.unwrap(geometry.yaw(np.asarray(record.quaternion, dtype=float)), axis=1)
     has_turned = np.abs(heading - heading[:, :1]) > TURN_BACK_ANGLE

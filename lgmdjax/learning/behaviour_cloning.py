@@ -44,7 +44,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.learning.checkpoints import Checkpoints, resumable
 from lgmdjax.learning.sequences import SequenceBatch, pack
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.simulation import sharding
+from lgmdjax.simulation import finite, sharding
 from lgmdjax.simulation.episodes import Walk
 
 TURN_GAIN = 1.5
@@ -274,7 +274,8 @@ def _train_epoch(
     carry = progress.weights, progress.optimiser, _init_states(params, train)
     (weights, memory, _), (squares, frames) = jax.lax.scan(window, carry, train)
     error = _batch_mse(replace(params, weights=weights), test)
-    better = ~(error >= jnp.nanmin(progress.test))  # true for the first epoch too, when all are nan
+    # The first epoch has none to compare with; an error that is not a number is never better.
+    better = (error < jnp.nanmin(progress.test)) | (progress.epoch == 0)
     return Progress(
         weights=weights,
         optimiser=memory,
@@ -341,8 +342,8 @@ def _require_sound(settings: Settings, train: Sequence[Walk], test: Sequence[Wal
     for name, walks in (("train", train), ("test", test)):
         if sum(len(walk) for walk in walks) < 2:
             raise InputError(f"training: expected frames to {name} on, got none; collect longer walks")
-        if not all(np.isfinite(x).all() for walk in walks for x in (walk.u, walk.label, walk.velocity)):
-            raise InputError(f"training: expected finite u and v to {name} on, got nan or infinity; collect them again")
+        if not all(finite.find_finite(walk).all() for walk in walks):
+            raise InputError(f"training: expected finite walks to {name} on, got nan or infinity; collect them again")
     return settings
 
 

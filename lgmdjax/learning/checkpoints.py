@@ -2,7 +2,8 @@
 
 Each checkpoint stores the identity of its fit, a fingerprint of data, settings and initial weights. A fit with
 another identity refuses the checkpoint. Only the newest checkpoint is kept; one that was interrupted while it was
-written is ignored.
+written is ignored. Beside the identity stands the checksum of the progress; checkpoints of versions before 0.3.0 have
+none. Numbers that were finite at the start of a fit are finite in what is resumed from.
 """
 
 import json
@@ -18,7 +19,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
-from lgmdjax.errors import InputError
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import checksums, interruption
 from lgmdjax.runtime.storage import JsonObject
 
 Progress = TypeVar("Progress")
@@ -33,13 +35,14 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path | str, identity: JsonObject):
-        logging.getLogger("absl").setLevel(logging.ERROR)  # orbax logs a line for every file
+        for name in ("absl", "asyncio"):  # orbax logs a line for every file, and errors that it raises as well
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self.folder, self.identity = Path(folder).absolute(), json.loads(json.dumps(identity))
         options = ocp.CheckpointManagerOptions(max_to_keep=1, create=True, enable_async_checkpointing=False)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.manager = ocp.CheckpointManager(self.folder, options=options)
-        except (OSError, ValueError) as error:
+        except Exception as error:
             raise InputError(
                 f"{folder}: expected a folder for checkpoints, got {_first_line(error)}; choose another"
             ) from error
@@ -55,9 +58,14 @@ class Checkpoints:
         template = jax.tree.map(ocp.utils.to_shape_dtype_struct, initial)
         try:
             identity = ocp.args.Composite(belongs=ocp.args.JsonRestore())  # pyright: ignore
-            self._require_same_identity(self.manager.restore(step, args=identity)["belongs"])
+            found = self.manager.restore(step, args=identity)["belongs"]
+            self._require_same_identity(found)
             contents = ocp.args.Composite(progress=ocp.args.StandardRestore(template))  # pyright: ignore
             restored = self.manager.restore(step, args=contents)["progress"]
+            if found.get(checksums.SEAL) not in (None, _digest(restored)):
+                raise checksums.ChecksumError("another checksum than that of what was saved")
+            if not all(jax.tree.leaves(jax.tree.map(_is_as_finite, initial, restored))):
+                raise checksums.ChecksumError("numbers that are not finite")
         except InputError:
             raise
         except Exception as error:  # orbax raises whatever its storage layer does
@@ -69,19 +77,23 @@ class Checkpoints:
 
     def save(self, step: int, progress: PyTree) -> None:
         """Write progress; it is complete on disk when this returns."""
+        identity = self.identity | {checksums.SEAL: _digest(progress)}
         args = ocp.args.Composite(
             progress=ocp.args.StandardSave(progress),  # pyright: ignore
-            belongs=ocp.args.JsonSave(self.identity),  # pyright: ignore  (the identity's name on disk)
+            belongs=ocp.args.JsonSave(identity),  # pyright: ignore  (the identity's name on disk)
         )
         try:
             self.manager.save(step, args=args)
             self.manager.wait_until_finished()
-        except OSError as error:
+        except Exception as error:  # of a full disk orbax raises whatever its storage layer does
             raise InputError(f"{self.folder}: expected to write, got {_first_line(error)}; free some disk") from error
 
     def close(self) -> None:
         """Close the folder."""
-        self.manager.close()
+        try:
+            self.manager.close()
+        except Exception as error:
+            raise InputError(f"{self.folder}: expected to write, got {_first_line(error)}; free some disk") from error
 
     def _require_same_identity(self, found: JsonObject) -> None:
         # A name that only one of both has belongs to another version of the package.
@@ -122,11 +134,23 @@ def resumable(
         end = min(step + chunk, total)
         progress = jax.block_until_ready(advance(progress, step, end))
         step = end
+        interruption.check()
         if checkpoints is not None and (step == total or time.monotonic() - last_saved >= interval):
             checkpoints.save(step, progress)
             last_saved = time.monotonic()
         yield step, progress
 
 
+def _digest(progress: PyTree) -> str:
+    """Return the checksum of all numbers, with their types and shapes."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(progress)]
+    return checksums.digest(repr([(str(leaf.dtype), leaf.shape, leaf.tobytes()) for leaf in leaves]).encode())
+
+
+def _is_as_finite(initial: PyTree, restored: PyTree) -> bool:
+    """Tell whether numbers are finite, or were not at the start: curves are nan where they are unknown."""
+    return bool(np.isfinite(restored).all() or not np.isfinite(initial).all())
+
+
 def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".split("\n")[0][:200]
+    return one_line(f"{type(error).__name__}: {error}".split("\n")[0])[:200]

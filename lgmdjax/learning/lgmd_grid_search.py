@@ -43,7 +43,7 @@ from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation.metrics import AVERAGING_TIME
 from lgmdjax.sensors import camera, hemifield
-from lgmdjax.simulation import rerender, rollout, sharding
+from lgmdjax.simulation import finite, rerender, rollout, sharding
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
 from lgmdjax.world import arena
 
@@ -125,14 +125,18 @@ def select(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: 
         feed_forward: FF, (robots, frames, 2) [grey].
         candidates: the pairs of constants.
 
-    Raises InputError if there are less than 10 s of steady walking.
+    Raises InputError if there are less than 10 s of steady walking, or responses that are not finite.
     """
+    record = finite.require_finite(record, "calibration")
     steady = _is_steady_walking(record)
     if steady.sum() < 10 * FRAME_RATE:
         raise InputError(
             f"calibration: expected 10 s or more of walking, got {steady.sum() / FRAME_RATE:.1f} s; "
             "record longer walks, or more robots"
         )
+    responses = np.concatenate([np.asarray(u), np.asarray(feed_forward)[..., None]], axis=-1)[steady]
+    if not np.isfinite(responses).all():
+        raise InputError("calibration: expected finite responses, got nan; are all textures of the rooms finite?")
     proximity = 1 / np.asarray(record.distances)
     averaged = ndimage.uniform_filter1d(np.asarray(u), round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
     pairs = zip(candidates.threshold.tolist(), candidates.inhibition.tolist(), strict=True)

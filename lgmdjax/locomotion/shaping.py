@@ -26,7 +26,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.paths import SHAPING_FILE
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import schema, storage
 from lgmdjax.runtime.storage import JsonObject
 
 LEGS, INPUTS, UNITS, JOINTS = 6, 3, 6, 3
@@ -34,6 +34,7 @@ MIN_VELOCITY, MAX_VELOCITY = -1.0, 2.0  # nominal velocities; the range for whic
 FILE = storage.TensorFile(
     format="lgmdjax.shaping", version="1", name="shaping networks", remedy="`lgmdjax fit-gait` makes one"
 )
+HEADER = schema.Object(optional={"literal": schema.Flag()})  # `printed_input`
 SHAPES = {
     "w1": (LEGS, INPUTS, UNITS),
     "b1": (LEGS, UNITS),
@@ -120,7 +121,8 @@ def save(path: Path | str, params: Params, metadata: Mapping[str, object] | None
 def load(path: Path | str) -> Params:
     """Return the networks that `save` wrote; raise `InputError` for another, damaged or outdated file."""
     weights, metadata = storage.load_tensors(path, FILE)
-    storage.check_shapes(path, weights, FILE, SHAPES)
+    storage.check_weights(path, weights, FILE, SHAPES)
+    schema.check(HEADER, metadata, f"{path}: header", FILE.remedy)
     arrays = {name: jnp.asarray(weight, dtype=float) for name, weight in weights.items()}
     return Params(**arrays, printed_input=metadata.get("literal") is True)
 

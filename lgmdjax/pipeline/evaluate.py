@@ -26,7 +26,7 @@ from lgmdjax.evaluation.settings import TrialPlan
 from lgmdjax.pipeline.settings import EvaluateSettings
 from lgmdjax.reporting import selection
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime.storage import write_json
+from lgmdjax.runtime.storage import write_arrays, write_json
 from lgmdjax.sensors import camera
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, episodes, rerender
@@ -55,11 +55,11 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: EvaluateSettings, se
             (folder / f"{trial.name}.svg").write_bytes(style.to_svg(figure))
     write_json(folder / "kinds.json", _collision_causes(settings, records, seed))
     continuing = {trial: some for trial, some in records.items() if not trials.TRIALS[trial].ends_at_contact}
-    np.savez(folder / "trajectories.npz", allow_pickle=False, **_trajectories(continuing))
+    write_arrays(folder / "trajectories.npz", _trajectories(continuing))
     shown = _one(records["testing"]["learned"], selection.select_walk(records["testing"]["learned"]))
-    np.savez(folder / "walk.npz", allow_pickle=False, **{name: getattr(shown, name) for name in episodes.FIELDS})
+    write_arrays(folder / "walk.npz", {name: getattr(shown, name) for name in episodes.FIELDS})
     camera_settings = next(plan.eyes for plan in settings.trials if plan.trial == "testing")
-    np.savez(folder / "layers.npz", allow_pickle=False, **_layers(robot.controller.lgmd, camera_settings, shown))
+    write_arrays(folder / "layers.npz", _layers(robot.controller.lgmd, camera_settings, shown))
 
 
 def _record(

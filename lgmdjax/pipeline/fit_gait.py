@@ -20,7 +20,7 @@ from lgmdjax.evaluation import gait_test
 from lgmdjax.evaluation.gait_test import GaitTrajectory
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
 from lgmdjax.pipeline.settings import FitGaitSettings
-from lgmdjax.runtime.storage import JsonObject, write_json
+from lgmdjax.runtime.storage import JsonObject, write_arrays, write_json
 
 SWEEP_COMMANDS = (
     (1.0, 1.0),
@@ -48,12 +48,16 @@ Walks = Mapping[Condition, Mapping[str, GaitTrajectory]]  # by condition and sim
 
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: FitGaitSettings, seed: int) -> None:
-    """Fit networks with both forms of the input, and measure walks with them in both simulators."""
+    """Fit networks with both forms of the input, and measure walks with them in both simulators.
+
+    Raises InputError, before anything is fitted, if `settings.seconds` is too short to measure a gait.
+    """
+    cpg_params = cpg.Params()
+    gait_test.require_duration(settings.seconds, float(cpg_params.cycle_time))
     body = hexapod.load()
     networks = {printed: _fit(body, settings, seed, printed) for printed in (False, True)}
     shaping.save(folder / "shaping.safetensors", networks[False], {"steps": settings.steps, "seed": seed})
-    cpg_params = cpg.Params()
-    np.savez(folder / "cpg.npz", allow_pickle=False, **_onset(cpg_params, seed))
+    write_arrays(folder / "cpg.npz", _onset(cpg_params, seed))
     steps = round(settings.seconds / gait_test.TIME_STEP)
     targets = {
         condition: gait_test.servo_targets(
@@ -68,7 +72,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: FitGaitSettings, see
         for (condition, own), walk in zip(targets.items(), in_mjx, strict=True)
     }
     write_json(folder / "gait.json", _summary(walks, float(cpg_params.cycle_time)))
-    np.savez(folder / "foot.npz", allow_pickle=False, **_foot_paths(body, targets, walks, float(cpg_params.cycle_time)))
+    write_arrays(folder / "foot.npz", _foot_paths(body, targets, walks, float(cpg_params.cycle_time)))
 
 
 def _fit(body: mujoco.MjModel, settings: FitGaitSettings, seed: int, printed_input: bool) -> shaping.Params:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lgmdjax.pipeline.report_figures import TITLES
-from lgmdjax.runtime.storage import JsonObject, read_json
+from lgmdjax.runtime.run_folders import read_facts
+from lgmdjax.runtime.storage import JsonObject, read_json, read_table
 from lgmdjax.sensors import camera
 from lgmdjax.studies import errata, failure_modes, sensitivity, supervision, velocity
 
@@ -50,7 +51,7 @@ class Results(NamedTuple):
 
 def read_results(run_folder: Path) -> Results:
     """Read the JSON files of a run folder; those of version 0.1.0 get the names of this version."""
-    facts, evaluation = read_json(run_folder / "run.json"), read_json(run_folder / "evaluate/evaluation.json")
+    facts, evaluation = read_facts(run_folder), read_table(run_folder / "evaluate/evaluation.json")
     settings = _with_present_names(facts["settings"])
     folders = {name: _study_folder(run_folder, name) for name in STUDIES if name in settings}
     stages = {stage: run_folder / stage for stage in STAGES} | folders
@@ -58,13 +59,13 @@ def read_results(run_folder: Path) -> Results:
     return Results(
         facts=facts,
         settings=settings,
-        gait=read_json(run_folder / "fit-gait/gait.json"),
+        gait=read_table(run_folder / "fit-gait/gait.json"),
         calibration=read_json(run_folder / "collect/calibration.json"),
-        training=read_json(run_folder / "train/training.json"),
+        training=read_table(run_folder / "train/training.json"),
         scores=scores,
         outcomes={trial: table for trial, table in evaluation.items() if trial not in scores},
         causes=read_json(run_folder / "evaluate/kinds.json"),
-        studies={name: _with_present_names(read_json(path / f"{path.name}.json")) for name, path in folders.items()},
+        studies={name: _with_present_names(read_table(path / f"{path.name}.json")) for name, path in folders.items()},
         stages=[{"name": name, **read_json(path / "done.json")} for name, path in stages.items()],
     )
 

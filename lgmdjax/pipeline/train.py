@@ -19,9 +19,11 @@ import numpy as np
 
 from lgmdjax.control import names, navigator
 from lgmdjax.detectors import lgmd
+from lgmdjax.errors import InputError
 from lgmdjax.learning import behaviour_cloning, dagger, sequences
 from lgmdjax.learning.settings import TrainSettings
-from lgmdjax.runtime.storage import write_json
+from lgmdjax.runtime import schema
+from lgmdjax.runtime.storage import write_arrays, write_json
 from lgmdjax.simulation import assembly, episodes
 from lgmdjax.simulation.closed_loop import FRAME_RATE
 from lgmdjax.simulation.episodes import Walk
@@ -33,7 +35,9 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     """Run DAgger, fit every variant to all walks, and save the paper's variant as the controller."""
     recorded = episodes.read(inputs["collect"] / "episodes")
     header = episodes.read_parameters(inputs["collect"] / "episodes")
-    np.savez(folder / "baselines.npz", allow_pickle=False, **_baselines(episodes.segments(recorded)))
+    baselines = _baselines(episodes.segments(recorded))
+    schema.check(assembly.BASELINES, baselines, "baselines", "collect again")
+    write_arrays(folder / "baselines.npz", baselines)
     detector = assembly.load_detector(inputs["collect"])
     robot = assembly.assemble_robot(inputs["fit-gait"], settings.eyes, detector, assembly.make_policies())
     walks = dagger.run(folder, robot, recorded, settings, seed)
@@ -65,7 +69,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     # The camera is that of the navigator's own walks, which are most of its training data.
     facts = {"eyes": dataclasses.asdict(settings.eyes), "seed": seed, "training": dataclasses.asdict(settings)}
     navigator.save(folder / "controller.safetensors", learned, header | facts)
-    np.savez(folder / "prediction.npz", allow_pickle=False, **_prediction(learned, unseen))
+    write_arrays(folder / "prediction.npz", _prediction(learned, unseen))
 
 
 def _fit_variants(
@@ -89,12 +93,14 @@ def _prediction(params: navigator.Params, segments: Sequence[Walk]) -> dict[str,
     return series | {"predicted": behaviour_cloning.predict(params, [walk])[0]}
 
 
-def _baselines(segments: Sequence[Walk]) -> dict[str, np.ndarray | float]:
+def _baselines(segments: Sequence[Walk]) -> dict[str, np.ndarray]:
     """Return the gain that makes the mean of u - 0.5 equal that of 1/e, and commands of the teacher to replay."""
+    if not segments:
+        raise InputError("expected walks without contact to train on, got none; collect longer ones")
     u = np.concatenate([walk.u for walk in segments])
     proximity = np.concatenate([1 / walk.corridor for walk in segments])
     commands = np.concatenate([walk.label for walk in segments])
     return {
-        "gain": proximity.mean() / max(float((u - lgmd.U_AT_REST).mean()), 1e-6),
+        "gain": np.asarray(proximity.mean() / max(float((u - lgmd.U_AT_REST).mean()), 1e-6)),
         "replayed": np.resize(commands, (assembly.REPLAY_LENGTH, 2)),
     }

@@ -1,8 +1,13 @@
+from . import checksums as checksums
 from . import compiled_code as compiled_code
 from . import export_cache as export_cache
+from . import interruption as interruption
 from . import jax_setup as jax_setup
 from . import mjx as mjx
+from . import partial_files as partial_files
+from . import program_cache as program_cache
 from . import pytree_json as pytree_json
 from . import run_folders as run_folders
+from . import schema as schema
 from . import storage as storage
 from . import versions as versions

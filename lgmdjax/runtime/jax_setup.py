@@ -1,22 +1,66 @@
-"""Environment variables that JAX reads when it is imported.
+"""Environment variables that JAX and others read when they are imported.
 
-This module does not import JAX, so that a program can call `prepare_jax` first.
+This module does not import them, so that a program can call `prepare_jax` first.
 """
 
 import os
 from pathlib import Path
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
+from lgmdjax.errors import InputError, one_line
+
+PREFIXES = ("JAX_", "XLA_", "CUDA_", "TF_CPP_", "MUJOCO_", "MPL", "PYOPENGL_")
+"""Of the variables that decide how libraries start."""
+MIN_MEMORY = 2e9  # bytes of address space; with less, XLA ends the process when it starts its threads
+COUNT = "JAX_NUM_CPU_DEVICES"
+
 
 def prepare_jax() -> None:
     """Set the environment variables of JAX that the user has not set.
 
-    Compiled programs are cached in ~/.cache/lgmdjax/jax, each CPU core becomes a device, over which robots are sharded,
-    and XLA logs less.
+    Compiled programs are cached in ~/.cache/lgmdjax/jax, or not at all for a user without a home folder. Each CPU core
+    becomes a device, over which robots are sharded, and XLA logs less.
     """
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    if home := _cache_home():
+        _set_default("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
+    _set_default("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(cores))
+    _set_default(COUNT, str(cores))
     # XLA logs its own tuning flags as errors whenever it reads a compiled program; real errors raise an exception.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    _set_default("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def check_variables() -> None:
+    """Raise `InputError` for a variable or a limit of memory that JAX would stop at without naming it."""
+    count = os.environ.get(COUNT, "1")
+    if not (count.isascii() and count.isdigit() and 0 < int(count) <= 1024):
+        raise InputError(f"expected {COUNT} of 1 to 1024, got {count!r}; unset it for one device on each core")
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0] if resource is not None else -1
+    if 0 <= limit < MIN_MEMORY:
+        gigabytes = f"expected {MIN_MEMORY / 1e9:g} GB of memory or more, got a limit of {limit / 1e9:.2g} GB"
+        raise InputError(f"{gigabytes}; raise it (ulimit -v)")
+
+
+def user_variables() -> str:
+    """Return the variables that the user has set, and that decide how libraries start, as one text; it may be empty."""
+    names = sorted(name for name in os.environ if name.startswith(PREFIXES) and os.environ[name] != _DEFAULTS.get(name))
+    return one_line(", ".join(f"{name}={os.environ[name]!r}" for name in names))
+
+
+_DEFAULTS: dict[str, str] = {}  # variables that `prepare_jax` set
+
+
+def _set_default(name: str, value: str) -> None:
+    if name not in os.environ:
+        os.environ[name] = _DEFAULTS[name] = value
+
+
+def _cache_home() -> Path | None:
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # neither HOME nor an entry in the list of users
+        return None

@@ -5,11 +5,12 @@
 | runs/<name>/run.json                       | format, scale, seed, settings and versions of the run            |
 | runs/<name>/<stage>.partial-<fingerprint>/ | files of a stage that is running, or was interrupted             |
 | runs/<name>/<stage>/                       | files of a finished stage, moved here in one step                |
-| runs/<name>/<stage>/done.json              | fingerprint, files, seconds of the last run, versions, device    |
+| runs/<name>/<stage>/done.json              | fingerprint, checksums of the files, seconds, versions, device   |
 | runs/<name>/.lock                          | locked by the process that runs stages                           |
 
 A stage's fingerprint covers its settings, the seed, the versions of its format and of lgmdjax, and the fingerprints of
-its inputs. A stage whose folder carries the fingerprint that it would get now is up to date.
+its inputs. A stage whose folder carries the fingerprint that it would get now, and whose files have the checksums that
+they had when it finished, is up to date. run.json and done.json have a checksum of their own.
 
 Folders of format 1 (version 0.1.0) named some settings otherwise. Their robots can be loaded; their stages cannot be
 resumed.
@@ -31,8 +32,8 @@ import jax
 from filelock import FileLock, Timeout
 
 from lgmdjax import __version__
-from lgmdjax.errors import InputError
-from lgmdjax.runtime import compiled_code, storage, versions
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import checksums, compiled_code, partial_files, schema, storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
 FORMAT = 2  # of the run folder; no stage is resumed in a folder of another format
@@ -63,29 +64,34 @@ class Run:
     folder: Path
     seed: int
     settings: Mapping[str, object]
+    remedy: str = "choose another --name"  # in messages: how to get another folder
 
 
-def open_run(out: Path, name: str, scale: str, seed: int, settings: Mapping[str, object]) -> Run:
+def open_run(
+    out: Path, name: str, scale: str, seed: int, settings: Mapping[str, object], *, remedy: str = Run.remedy
+) -> Run:
     """Open the run folder out/name, or make it.
 
-    Raises `InputError` for a folder that cannot be written, or that was made with another scale, seed or settings.
+    Raises `InputError` for a folder that cannot be written, that another process uses, or that was made with another
+    scale, seed or settings.
     """
-    if name in ("", ".", "..") or Path(name).name != name:
+    if name in ("", ".", "..") or Path(name).name != name or not name.isprintable():
         raise InputError(f"expected a plain folder name for the run, got {name!r}; use --out for the path")
     if not 0 <= seed < SEED_LIMIT:
         raise InputError(f"expected a seed of 0 to {SEED_LIMIT - 1}, got {seed}; choose another --seed")
-    folder = out / name
+    run = Run(folder=out / name, seed=seed, settings=settings, remedy=remedy)
     requested = {"format": FORMAT, "scale": scale, "seed": seed, "settings": _to_json(settings)}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if (folder / "run.json").exists():
-            _check_same(folder, requested)
-        else:
-            storage.write_json(folder / "run.json", requested | {"versions": versions.installed()})
-        (folder / ".lock").touch()
+        run.folder.mkdir(parents=True, exist_ok=True)
+        if not (run.folder / "run.json").exists():
+            with _locked(run):
+                facts = checksums.seal(requested | {"versions": versions.installed()})
+                storage.write_json(run.folder / "run.json", facts)
+        _check_same(run, requested)
+        (run.folder / ".lock").touch()
     except OSError as error:
-        raise storage.not_writable(folder, error) from error
-    return Run(folder=folder, seed=seed, settings=settings)
+        raise partial_files.not_writable(run.folder, error) from error
+    return run
 
 
 def execute(run: Run, stages: Sequence[Stage], target: str) -> Path:
@@ -106,7 +112,9 @@ def execute(run: Run, stages: Sequence[Stage], target: str) -> Path:
     ]
     required = _required_stages({stage.name: stage for stage in stages}, target)
     fingerprints: dict[str, str] = {}
-    with _locked(run.folder):
+    with _locked(run):
+        for abandoned in run.folder.glob("*.partial"):
+            abandoned.unlink(missing_ok=True)
         for stage in stages:
             if stage.name in required:
                 settings = run.settings[stage.name]
@@ -139,11 +147,16 @@ def describe_devices() -> str:
 def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
     """Run one stage unless it is up to date."""
     final = run.folder / stage.name
-    if _is_done(final, stage_fingerprint):
+    fault = _find_fault(final, stage_fingerprint)
+    if fault is None:
         print(f"{stage.name}: up to date in {final}", flush=True)
         return
+    if fault:
+        print(f"{stage.name}: done again, because {fault}", flush=True)
     partial = run.folder / f"{stage.name}.partial-{stage_fingerprint}"
-    if not _is_done(partial, stage_fingerprint):  # done if the process was killed right before the move below
+    _adopt_stamp(partial)
+    if _find_fault(partial, stage_fingerprint) is not None:  # None if the process was killed before the move below
+        (partial / checksums.STAMP).unlink(missing_ok=True)
         for outdated in set(run.folder.glob(f"{stage.name}.partial-*")) - {partial}:
             shutil.rmtree(outdated)
         _print_start(stage, final, run.seed, resumed=partial.exists())
@@ -152,19 +165,28 @@ def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
     if final.exists():
         shutil.rmtree(final)
     os.replace(partial, final)
+    partial_files.sync(run.folder)
+
+
+def _adopt_stamp(folder: Path) -> None:
+    """Give a done.json its name that a process wrote to its end, but was killed before it could name it."""
+    for written in folder.glob(f"{checksums.STAMP}.*.partial"):
+        with contextlib.suppress(OSError, ValueError, RecursionError):
+            if checksums.is_sealed(json.loads(written.read_bytes())):
+                os.replace(written, folder / checksums.STAMP)
 
 
 def _run_in(folder: Path, run: Run, stage: Stage, stage_fingerprint: str) -> float:
     """Run a stage in a folder, which may hold files of an interrupted run; return the seconds that it took."""
     folder.mkdir(exist_ok=True)
-    storage.remove_partial_files(folder)
+    partial_files.remove_partial_files(folder)
     start = time.perf_counter()
     inputs = {name: run.folder / name for name in stage.inputs}
     stage.run(folder, inputs, run.settings[stage.name], run.seed)
     seconds = time.perf_counter() - start
     compiled_code.clear_caches_if_crowded()
-    stamp = {"fingerprint": stage_fingerprint, "seconds": round(seconds, 1), "versions": versions.installed()}
-    storage.write_json(folder / "done.json", stamp | {"device": describe_devices(), "files": _file_sizes(folder)})
+    facts = {"fingerprint": stage_fingerprint, "seconds": round(seconds, 1), "versions": versions.installed()}
+    storage.write_stamp(folder, facts | {"device": describe_devices()})
     return seconds
 
 
@@ -175,18 +197,25 @@ def _print_start(stage: Stage, final: Path, seed: int, *, resumed: bool) -> None
     print(f"{stage.name}: {verb} on {describe_devices()}; {packages}; seed {seed}; into {final}", flush=True)
 
 
-def _is_done(folder: Path, stage_fingerprint: str) -> bool:
-    """Tell whether a folder holds all files of a stage that finished with this fingerprint."""
+def _find_fault(folder: Path, stage_fingerprint: str) -> str | None:
+    """Return None if a folder has a finished stage of this fingerprint, else what is wrong; "" if nothing was there."""
+    if not (folder / checksums.STAMP).exists():
+        return f"{folder} has no {checksums.STAMP}" if folder.exists() else ""
     try:
-        stamp = json.loads((folder / "done.json").read_text())
-        return stamp["fingerprint"] == stage_fingerprint and stamp["files"].items() <= _file_sizes(folder).items()
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return False  # the stamp is missing or damaged, so the stage runs again
+        stamp = checksums.read_stamp(folder)
+        if stamp.facts.get("fingerprint") != stage_fingerprint:
+            return "something that it depends on has changed"
+        files = stamp.facts["files"] if stamp.files is None else stamp.files
+        found = _file_sizes(folder) if stamp.files is None else checksums.list_files(folder)
+    except (OSError, KeyError, checksums.ChecksumError) as error:
+        return one_line(error)
+    changed = [name for name, value in files.items() if found.get(name) != value]
+    return f"{folder / changed[0]} is missing or has changed" if changed else None
 
 
 def _file_sizes(folder: Path) -> dict[str, int]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "done.json")
-    return {str(path.relative_to(folder)): path.stat().st_size for path in files}
+    """Return the sizes of all files, which done.json listed before it had checksums."""
+    return {str(path.relative_to(folder)): path.stat().st_size for path in folder.rglob("*") if path.is_file()}
 
 
 def _required_stages(stages: Mapping[str, Stage], target: str) -> set[str]:
@@ -203,27 +232,38 @@ def _to_json(settings: object) -> object:
     return json.loads(json.dumps(settings))
 
 
-def _check_same(folder: Path, requested: JsonObject) -> None:
+SEED = schema.Integer(0, SEED_LIMIT - 1)
+RUN_FACTS = schema.Object({"format": schema.Integer(1, 1000), "settings": schema.Object()}, {"seed": SEED})
+"""What run.json holds in every format."""
+PRESENT_FACTS = schema.Object({"scale": schema.Text(), "seed": SEED, "versions": schema.Object()})
+"""What it holds besides in the present format."""
+
+
+def read_facts(folder: Path) -> JsonObject:
+    """Read the run.json of a run folder; raise `InputError` for one that is missing, damaged or not as expected."""
+    path = folder / "run.json"
+    facts = storage.read_json(path)
+    schema.check(RUN_FACTS, facts, str(path), "delete the folder, or choose another")
+    if facts["format"] == FORMAT:
+        schema.check(PRESENT_FACTS, facts, str(path), "delete the folder, or choose another")
+    return facts
+
+
+def _check_same(run: Run, requested: JsonObject) -> None:
     """Raise `InputError` unless a run folder was made in this format with the requested scale, seed and settings."""
-    try:
-        recorded = json.loads((folder / "run.json").read_text())
-        maker = None if recorded["format"] == FORMAT else "a newer" if recorded["format"] > FORMAT else "an older"
-        difference = None if maker else _first_difference({key: recorded[key] for key in requested}, requested)
-    except (ValueError, KeyError, TypeError) as error:
+    recorded = read_facts(run.folder)
+    if recorded["format"] != FORMAT:
+        maker = "a newer" if recorded["format"] > FORMAT else "an older"
         raise InputError(
-            f"expected the settings of a run in {folder / 'run.json'}, got a file that cannot be read; "
-            "choose another --name, or delete the folder"
-        ) from error
-    if maker:
-        raise InputError(
-            f"expected a run folder of format {FORMAT}, got {folder} of format {recorded['format']}, made by {maker} "
-            "lgmdjax; its robot can still be used with --run; choose another --name to run the stages"
+            f"expected a run folder of format {FORMAT}, got {run.folder} of format {recorded['format']}, made by "
+            f"{maker} lgmdjax; its robot can still be used with --run; {run.remedy} to run the stages"
         )
+    difference = _first_difference({key: recorded[key] for key in requested}, requested)
     if difference:
         key, found, expected = difference
         raise InputError(
-            f"expected a run folder made with {key} = {expected}, got {folder} made with {found}; "
-            "choose another --name or --out, or delete the folder"
+            f"expected a run folder made with {key} = {expected}, got {run.folder} made with {found}; "
+            f"{run.remedy}, or delete the folder"
         )
 
 
@@ -240,13 +280,13 @@ def _first_difference(found: object, expected: object, key: str = "") -> tuple[s
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _locked(run: Run) -> Iterator[None]:
     """Hold the lock of a run folder; the operating system releases it however the process ends."""
     try:
-        lock = FileLock(folder / ".lock").acquire(blocking=False)
+        lock = FileLock(run.folder / ".lock").acquire(blocking=False)
     except Timeout as error:
         raise InputError(
-            f"expected {folder} to be unused, got one where another process runs stages; wait, or choose another --name"
+            f"expected {run.folder} to be unused, got one where another process runs stages; wait, or {run.remedy}"
         ) from error
     with lock:
         yield

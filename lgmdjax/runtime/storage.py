@@ -1,19 +1,21 @@
-"""Files that appear whole or not at all, and one-line errors for files that cannot be read.
+"""Files that are written whole or not at all, and one-line errors for files that cannot be read.
 
 | file                     | written by                       | read by                     |
 | ------------------------ | -------------------------------- | --------------------------- |
-| JSON                     | `write_json`                     | `read_json`                 |
-| npz                      | the stages                       | `read_arrays`               |
+| JSON                     | `write_json`, `write_stamp`      | `read_json`, `read_table`   |
+| npz                      | `write_arrays`                   | `read_arrays`               |
 | safetensors              | `save_tensors`                   | `load_tensors`              |
 | any other                | `replacing`, `replacing_all`     | the module that knows it    |
 | a new folder             | `new_folder`                     | the user                    |
+
+What is read is compared with its checksum, where it has one (`lgmdjax.runtime.checksums`). A file is written under a
+temporary name first (`lgmdjax.runtime.partial_files`).
 """
 
 import contextlib
+import io
 import json
-import os
-import shutil
-import tempfile
+import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -21,11 +23,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.numpy import save as serialise
 
-from lgmdjax.errors import InputError
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.paths import PACKAGE_DIR
+from lgmdjax.runtime import checksums, schema
+from lgmdjax.runtime.partial_files import new_folder as new_folder
+from lgmdjax.runtime.partial_files import not_writable as not_writable
+from lgmdjax.runtime.partial_files import remove_partial_files as remove_partial_files
+from lgmdjax.runtime.partial_files import replacing as replacing
+from lgmdjax.runtime.partial_files import replacing_all as replacing_all
+from lgmdjax.runtime.partial_files import require_empty as require_empty
+from lgmdjax.runtime.partial_files import sync as sync
 
 JsonObject = dict[str, Any]
 """A JSON object: a row of a study, a file's header."""
@@ -33,150 +43,103 @@ JsonObject = dict[str, Any]
 Shapes = Mapping[str, tuple[int, ...]]
 """Shapes of arrays by name."""
 
-PARTIAL_PREFIX = ".partial-"
-"""Of the temporary folders of `replacing_all`."""
-
-LOCK_NAME = ".lock"
-"""File in a temporary folder, locked while a process works there."""
-
-STAGE_COMMANDS = ("fit-gait", "collect", "train", "evaluate", "report")
+STAGE_COMMANDS = ("fit-gait", "collect", "train", "evaluate", "report", "trial")
 """Commands that write a folder of their own name."""
 
+REINSTALL = "install lgmdjax again"  # what to do about a damaged file of the package
 
-@contextlib.contextmanager
-def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
-    """Yield a temporary path in the folder of `path`; at the end of the block the file there replaces `path`.
-
-    A block that raises leaves `path` as it was, and no temporary file. A process that is killed leaves a temporary
-    file, `<name>.<process>.partial` (`remove_partial_files`).
-
-    Args:
-        path: of the file.
-        sync: wait until the content is on the disk, so that not even a power cut leaves half a file.
-    """
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        yield partial
-        if sync:
-            with partial.open("rb+") as file:
-                os.fsync(file.fileno())
-        os.replace(partial, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise
-
-
-@contextlib.contextmanager
-def replacing_all(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder; at the end of the block its files move into `folder`, which is made if need be.
-
-    A block that raises leaves `folder` as it was. What a killed process left there is removed; its lock tells that it
-    has ended.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for abandoned in folder.glob(f"{PARTIAL_PREFIX}*"):
-            _remove_abandoned(abandoned)
-        work = tempfile.TemporaryDirectory(prefix=PARTIAL_PREFIX, dir=folder)
-    except OSError as error:
-        raise not_writable(folder, error) from error
-    try:
-        with work, FileLock(Path(work.name) / LOCK_NAME):
-            yield Path(work.name)
-            for file in Path(work.name).iterdir():
-                if file.name != LOCK_NAME:
-                    os.replace(file, folder / file.name)
-    finally:
-        with contextlib.suppress(OSError):  # the folder has other files
-            folder.rmdir()
-
-
-def _remove_abandoned(partial: Path) -> None:
-    """Remove a temporary folder of `replacing_all` unless a process works in it."""
-    lock = FileLock(partial / LOCK_NAME)
-    with contextlib.suppress(Timeout, OSError), lock.acquire(timeout=0):
-        shutil.rmtree(partial)
-
-
-def require_empty(folder: Path) -> None:
-    """Raise `InputError` unless a folder is empty or missing, so that nothing of the user's is replaced."""
-    if folder.is_dir() and not any(folder.iterdir()):
-        return
-    if folder.exists() or folder.is_symlink():
-        content = "has files" if folder.is_dir() else "is no folder"
-        raise InputError(f"expected an empty or a new folder, got {folder}, which {content}; choose another")
-
-
-@contextlib.contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `folder`; at the end of the block it becomes `folder`, with all of its files.
-
-    A block that raises leaves nothing. Raises `InputError` for a folder that has files or cannot be made.
-    """
-    require_empty(folder)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        work = tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent)
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"expected a folder that can be made, got {folder} ({reason}); choose another") from error
-    with work:
-        whole = Path(work.name, folder.name)
-        whole.mkdir()
-        yield whole
-        require_empty(folder)
-        if folder.exists():
-            folder.rmdir()
-        os.replace(whole, folder)
-
-
-def remove_partial_files(folder: Path) -> None:
-    """Remove what killed processes left of unfinished files in a folder and in those below it."""
-    for pattern in ("*.partial", "*.part"):  # version 0.1.0 wrote *.part
-        for abandoned in folder.rglob(pattern):
-            if abandoned.is_file():
-                abandoned.unlink(missing_ok=True)
-
-
-def not_writable(folder: Path, error: OSError) -> InputError:
-    """Return the error to raise when results cannot be written to a folder."""
-    reason = error.strerror or error
-    return InputError(f"expected a folder that can be written, got {folder} ({reason}); choose another --out")
+MAX_WEIGHT = 1e6  # of a network: sums of products of such numbers are far from overflowing in single precision
 
 
 def write_json(path: Path, content: object) -> None:
-    """Write a JSON file, whole or not at all."""
+    """Write a JSON file, whole or not at all; numbers that are not finite, which JSON lacks, become null."""
     with replacing(path) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n")
+        partial.write_text(json.dumps(_finite_or_null(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_stamp(folder: Path, facts: JsonObject) -> None:
+    """Write the done.json of a folder: some facts, and the checksums of all files, which are synced first."""
+    for path in sorted(folder.rglob("*")):
+        sync(path)
+    sync(folder)
+    write_json(folder / checksums.STAMP, checksums.seal({**facts, "files": checksums.list_files(folder)}))
 
 
 def read_json(path: Path) -> Any:
     """Read a JSON file of a run folder; raise `InputError` for a missing or damaged one."""
     with _naming_command(path):
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(checksums.read_bytes(path))
+        checksums.require_seal(content)
+        return content
+
+
+def read_table(path: Path) -> Any:
+    """Read a JSON file of numbers of a run folder, in which null is an unknown number, nan."""
+    return _null_as_nan(read_json(path))
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray | float]) -> None:
+    """Write an npz file, whole or not at all."""
+    with replacing(path) as partial, partial.open("wb") as file:  # given a name, NumPy would append its suffix
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays of an npz file of a run folder; raise `InputError` for a missing or damaged one."""
-    with _naming_command(path), np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+    with _naming_command(path):
+        content = checksums.read_bytes(path)
+        _require_sizes(content)
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+
+
+def _finite_or_null(content: object) -> object:
+    if isinstance(content, Mapping):
+        return {key: _finite_or_null(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite_or_null(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def _null_as_nan(content: object) -> object:
+    if isinstance(content, dict):
+        return {key: _null_as_nan(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_null_as_nan(value) for value in content]
+    return math.nan if content is None else content
+
+
+def _require_sizes(content: bytes) -> None:
+    """Raise `ValueError` unless all arrays of an npz file are as large as they say, before memory is asked for."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for member in archive.infolist():
+            with archive.open(member) as file:
+                read_header = {
+                    (1, 0): np.lib.format.read_array_header_1_0,
+                    (2, 0): np.lib.format.read_array_header_2_0,
+                }[np.lib.format.read_magic(file)]
+                shape, _, dtype = read_header(file)
+                stated = math.prod(shape) * dtype.itemsize
+                is_honest = file.tell() + stated == member.file_size <= len(content)
+                if min(shape, default=0) < 0 or not is_honest:
+                    raise ValueError(f"{member.filename} says that it has {stated} bytes")
 
 
 @contextlib.contextmanager
 def _naming_command(path: Path) -> Iterator[None]:
     """Turn an error of reading into one that names the file, and the command that makes it."""
     folder = path.parent.name.partition(".")[0]
+    is_shipped = path.is_relative_to(PACKAGE_DIR)
     command = folder if path.name != "run.json" and folder in STAGE_COMMANDS else "reproduce"
     try:
         yield
     except FileNotFoundError as error:
         raise InputError(f"expected {path}, found none; run `lgmdjax {command}` first") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        reason = " ".join(str(error).split())[:200]
+    except Exception as error:  # whatever a damaged file makes json, zipfile and NumPy raise
+        reason = one_line(error)[:200] or type(error).__name__
         raise InputError(
             f"expected {path} as `lgmdjax {command}` writes it, got a file that cannot be read ({reason}); "
-            f"delete its folder and run `lgmdjax {command}` again"
+            + (REINSTALL if is_shipped else f"delete its folder and run `lgmdjax {command}` again")
         ) from error
 
 
@@ -195,13 +158,14 @@ def save_tensors(
 ) -> None:
     """Write arrays and `metadata` (JSON values) as one safetensors file, whole or not at all.
 
-    Raises `InputError` for arrays that are not finite, and where the file cannot be written.
+    Raises `InputError` for weights that `load_tensors` would refuse, and where the file cannot be written.
     """
     path = Path(path)
     if not _all_finite(tensors):
         raise InputError(f"{path}: expected finite weights to save, got some that are not; train again")
     header = {"format": kind.format, "version": kind.version}
     header |= {name: json.dumps(value) for name, value in metadata.items()}
+    header[checksums.SEAL] = json.dumps(_digest_tensors(tensors, header))
     try:
         with replacing(path) as partial:
             partial.write_bytes(serialise(dict(tensors), header))
@@ -215,27 +179,43 @@ def load_tensors(path: Path | str, kind: TensorFile) -> tuple[dict[str, np.ndarr
 
     Raises `InputError` for a file that is missing, damaged, of another format or version, or not finite.
     """
+    remedy = REINSTALL if Path(path).is_relative_to(PACKAGE_DIR) else kind.remedy
     try:
+        checksums.read_bytes(Path(path))
         with safe_open(path, framework="numpy") as file:
             header = file.metadata() or {}
             if header.get("format") != kind.format:
-                raise InputError(f"{path}: expected {kind.name}, got another kind of file; {kind.remedy}")
+                raise InputError(f"{path}: expected {kind.name}, got another kind of file; {remedy}")
             if header.get("version") != kind.version:
-                raise InputError(f"{path}: expected version {kind.version}, got {header.get('version')}; {kind.remedy}")
+                raise InputError(f"{path}: expected version {kind.version}, got {header.get('version')}; {remedy}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         metadata = {name: json.loads(text) for name, text in header.items() if name not in ("format", "version")}
-    except (OSError, SafetensorError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: expected safetensors with {kind.name}, got {error}; {kind.remedy}") from error
+        if metadata.pop(checksums.SEAL, None) not in (None, _digest_tensors(tensors, header)):
+            raise checksums.ChecksumError("a file with another checksum in its header")
+    except InputError:
+        raise
+    except Exception as error:  # whatever a damaged file makes safetensors, json and NumPy raise
+        reason = one_line(error)[:200]
+        raise InputError(f"{path}: expected safetensors with {kind.name}, got {reason}; {remedy}") from error
     if not _all_finite(tensors):
-        raise InputError(f"{path}: expected finite weights, got some that are not; {kind.remedy}")
+        raise InputError(f"{path}: expected finite weights, got some that are not; {remedy}")
     return tensors, metadata
 
 
-def check_shapes(path: Path | str, tensors: Mapping[str, np.ndarray], kind: TensorFile, expected: Shapes) -> None:
-    """Raise `InputError` unless a file's arrays have the names and shapes that are expected."""
+def _digest_tensors(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:
+    """Return the checksum of arrays and of a header, but for the header's own checksum."""
+    arrays = [(name, str(array.dtype), array.shape, array.tobytes()) for name, array in sorted(tensors.items())]
+    rest = sorted((name, text) for name, text in header.items() if name != checksums.SEAL)
+    return checksums.digest(repr((rest, arrays)).encode())
+
+
+def check_weights(path: Path | str, tensors: Mapping[str, np.ndarray], kind: TensorFile, expected: Shapes) -> None:
+    """Raise `InputError` unless a file's arrays have these names and shapes, and are floats below `MAX_WEIGHT`."""
     found = {name: value.shape for name, value in tensors.items()}
     if found != expected:
         raise InputError(f"{path}: expected weights {expected}, got {found}; {kind.remedy}")
+    for name, value in tensors.items():
+        schema.check(schema.Numbers(value.shape, -MAX_WEIGHT, MAX_WEIGHT), value, f"{path}: {name}", kind.remedy)
 
 
 def _all_finite(tensors: Mapping[str, np.ndarray]) -> bool:

@@ -1,6 +1,8 @@
 from . import assembly as assembly
 from . import closed_loop as closed_loop
+from . import episode_tables as episode_tables
 from . import episodes as episodes
+from . import finite as finite
 from . import recording as recording
 from . import rerender as rerender
 from . import rollout as rollout

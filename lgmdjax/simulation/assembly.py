@@ -15,13 +15,30 @@ from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.locomotion import shaping
 from lgmdjax.paths import PRETRAINED_DIR
-from lgmdjax.runtime.storage import read_arrays, read_json
+from lgmdjax.runtime import schema
+from lgmdjax.runtime.storage import JsonObject, read_arrays, read_json
 from lgmdjax.sensors import camera, hemifield
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import closed_loop
 
 REPLAY_LENGTH = 4096  # velocities of policy random; static, so that one compiled program serves all stages
 CALIBRATED = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
+LGMD = schema.Object(
+    {
+        "threshold": schema.Number(0, 255),  # grey
+        "suppression": schema.Number(0, 2 * 255),  # grey; twice the largest FF is as good as none
+        "inhibition": schema.Number(0, 100),
+    }
+)
+SIDE = schema.Integer(1, camera.MAX_SIZE)  # px
+FIELD = {"overlap": schema.Number(0.5, 1), "ground": schema.Number(0, 0.99), "falloff": schema.Number(0, 100)}
+EYES = schema.Object({"width": SIDE, "height": SIDE}, {**FIELD, "pooling": SIDE})
+HEADER = schema.Object({"eyes": EYES, "lgmd": LGMD})
+"""What the header of a controller holds besides the network's structure."""
+BASELINES = schema.Object(
+    {"gain": schema.Numbers((), -1e9, 1e9), "replayed": schema.Numbers((REPLAY_LENGTH, 2), -10, 10)}
+)
+"""What baselines.npz holds: the gain of policy direct [1/m], and velocities [nominal] of policy random."""
 
 
 def camera_params(settings: CameraSettings) -> camera.Params:
@@ -55,15 +72,16 @@ def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAIN
 
     Raises InputError if a folder lacks the files of its stage.
     """
-    navigator_params, header = navigator.load(train_folder / "controller.safetensors")
-    baselines = read_arrays(train_folder / "baselines.npz")
-    try:
-        switch = make_policies(navigator_params, float(baselines["gain"]), baselines["replayed"])
-        return assemble_robot(gait_folder, CameraSettings(**header["eyes"]), lgmd.Params(**header["lgmd"]), switch)
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{train_folder}: expected files as `lgmdjax train` writes them, got {error}; train again"
-        ) from error
+    controller, baselines = train_folder / "controller.safetensors", train_folder / "baselines.npz"
+    navigator_params, header = navigator.load(controller)
+    schema.check(HEADER, header, f"{controller}: header", "train again")
+    arrays = read_arrays(baselines)
+    schema.check(BASELINES, arrays, str(baselines), "train again")
+    switch = make_policies(navigator_params, float(arrays["gain"]), arrays["replayed"])
+    smallest = min(header["eyes"]["width"], header["eyes"]["height"])
+    schema.check(schema.Integer(1, smallest), header["eyes"].get("pooling", 1), f"{controller}: pooling", "train again")
+    eyes = {name: header["eyes"][name] for name in (*EYES.fields, *EYES.optional) if name in header["eyes"]}
+    return assemble_robot(gait_folder, CameraSettings(**eyes), _lgmd_params(header["lgmd"]), switch)
 
 
 def assemble_robot(
@@ -171,5 +189,12 @@ def fingerprint(params: closed_loop.Params) -> str:
 
 def load_detector(folder: Path) -> lgmd.Params:
     """Return the LGMD that stage collect calibrated, from its folder."""
-    calibration = read_json(folder / "calibration.json")
-    return lgmd.Params(**{name: calibration[name] for name in CALIBRATED})
+    path = folder / "calibration.json"
+    calibration = read_json(path)
+    schema.check(LGMD, calibration, str(path), "run `lgmdjax collect` again")
+    return _lgmd_params(calibration)
+
+
+def _lgmd_params(constants: JsonObject) -> lgmd.Params:
+    threshold, suppression, inhibition = (float(constants[name]) for name in CALIBRATED)
+    return lgmd.Params(threshold=threshold, suppression=suppression, inhibition=inhibition)

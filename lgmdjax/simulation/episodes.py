@@ -18,7 +18,9 @@ A walk is the recorded trajectory of one robot in one room.
 
 Pictures are not stored: `lgmdjax.simulation.rerender` renders them again from the poses. A walk is written in chunks.
 Each chunk is a file that gets its name when it is complete, so that an interruption loses only the present chunk.
-Numbers keep their precision.
+Numbers keep their precision. The header has a checksum of the columns and of itself; files of earlier versions have
+none. What is not as the table says is refused: other types, missing or infinite numbers in frames that are ok, time
+that does not increase, a walk in two rooms.
 
 Version 1 called the columns `is_first` and `resets` "fresh" and "setbacks"; versions 1 and 2 lack `corridor_*`, for
 which `distance_*` is read. Both can still be read.
@@ -28,7 +30,6 @@ Source: Cizek & Faigl, sec. 4.2 and 5.1: the training data are segments of colli
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -38,10 +39,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from flax import struct
 
-from lgmdjax.errors import InputError
-from lgmdjax.runtime import storage, versions
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import checksums, partial_files, schema, versions
 from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.simulation import episode_tables, finite
 from lgmdjax.simulation.closed_loop import Record
+from lgmdjax.simulation.episode_tables import COLUMNS as COLUMNS
+from lgmdjax.simulation.episode_tables import FIELDS as FIELDS
+from lgmdjax.simulation.episode_tables import ORIGIN, SIDES
 
 FORMAT, VERSION = "lgmdjax episodes", 3
 RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, 2: {}, VERSION: {}}
@@ -49,39 +54,11 @@ RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, 2: {}, VERSION: {}}
 NEAREST_ONLY = (1, 2)
 """Versions without distances along the corridor: their teacher reacted to the nearest distances."""
 
-SIDES = ("left", "right")
-
-
-@dataclass(frozen=True)
-class Field:
-    """Names of the columns that hold one field of `Record`, and their unit."""
-
-    columns: tuple[str, ...]
-    unit: str = ""
-
-
-FIELDS: Mapping[str, Field] = {
-    "time": Field(("time",), "s"),
-    "position": Field(("x", "y", "z"), "m"),
-    "quaternion": Field(("qw", "qx", "qy", "qz"), "1"),
-    "joints": Field(tuple(f"joint_{j}" for j in range(18)), "rad"),
-    "u": Field(tuple(f"u_{side}" for side in SIDES), "1"),
-    "feed_forward": Field(tuple(f"feed_forward_{side}" for side in SIDES), "grey"),
-    "excitation": Field(tuple(f"excitation_{side}" for side in SIDES), "grey"),
-    "distances": Field(tuple(f"distance_{side}" for side in SIDES), "m"),
-    "corridor": Field(tuple(f"corridor_{side}" for side in SIDES), "m"),
-    "label": Field(tuple(f"label_{side}" for side in SIDES), "0.05 m/s"),
-    "velocity": Field(tuple(f"velocity_{side}" for side in SIDES), "0.05 m/s"),
-    "clearance": Field(("clearance",), "m"),
-    "contact": Field(("contact",)),
-    "is_first": Field(("is_first",)),
-    "resets": Field(("resets",)),
-    "ok": Field(("ok",)),
-}
-"""The columns of each field of `Record`, in its order."""
-
-ORIGIN = ("episode", "robot", "room", "seed")
-COLUMNS = (*ORIGIN, *(column for field in FIELDS.values() for column in field.columns))
+HEADER = schema.Object(
+    {"format": schema.Text((FORMAT,)), "parameters": schema.Object()},
+    {checksums.SEAL: schema.Text(), "units": schema.Object(), "versions": schema.Object()},
+)
+"""What the header of a chunk holds, beside its version."""
 
 
 @struct.dataclass(kw_only=True)
@@ -111,10 +88,14 @@ class Writer:
 
     def __init__(self, folder: Path | str, parameters: JsonObject):
         self.folder = Path(folder)
-        self.parameters = json.loads(json.dumps(parameters))
+        try:
+            self.parameters = json.loads(json.dumps(parameters, allow_nan=False))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InputError(f"episodes parameters: expected JSON values, got {error}; convert them") from error
+        schema.check(schema.Object(), self.parameters, "episodes parameters", "name them")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            storage.remove_partial_files(self.folder)
+            partial_files.remove_partial_files(self.folder)
         except OSError as error:
             raise InputError(f"{folder}: expected a folder to write to, got {error}; choose another") from error
         self.chunks = len(_files(self.folder)) and len(_tables(self.folder, self.parameters))
@@ -123,23 +104,23 @@ class Writer:
         """Write one chunk of a batch of walks and return its path.
 
         Args:
-            record: axes (robot, frame).
+            record: axes (robot, frame), finite in all frames that are ok.
             episode: index of the batch.
             rooms: index of the room of each robot.
             seed: seed of the rooms.
         """
-        table = _table(record, episode, rooms, seed)
+        table = episode_tables.from_record(record, episode, rooms, seed)
         path = self.folder / f"chunk-{self.chunks:05d}.parquet"
-        table = table.replace_schema_metadata(self._metadata())
+        table = table.replace_schema_metadata(self._metadata(table))
         try:
-            with storage.replacing(path, sync=True) as partial:
+            with partial_files.replacing(path) as partial:
                 pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
         except OSError as error:
             raise InputError(f"{path}: expected to write a chunk, got {error}; free some disk") from error
         self.chunks += 1
         return path
 
-    def _metadata(self) -> dict[str, str]:
+    def _metadata(self, table: pa.Table) -> dict[str, str]:
         units = {column: field.unit for field in FIELDS.values() for column in field.columns if field.unit}
         header = {
             "format": FORMAT,
@@ -148,7 +129,7 @@ class Writer:
             "parameters": self.parameters,
             "versions": versions.installed(),
         }
-        return {"lgmdjax": json.dumps(header)}
+        return {"lgmdjax": json.dumps(header | {checksums.SEAL: episode_tables.digest(table, header)})}
 
 
 def read(folder: Path | str, parameters: JsonObject | None = None) -> list[Walk]:
@@ -170,13 +151,13 @@ def read(folder: Path | str, parameters: JsonObject | None = None) -> list[Walk]
     order = np.lexsort((columns["robot"], columns["episode"]))
     columns = {name: values[order] for name, values in columns.items()}
     changes = (np.diff(columns["episode"]) != 0) | (np.diff(columns["robot"]) != 0)
-    return [_walk(columns, slice(*span)) for span in _runs(changes)]
+    return [_walk(folder, {name: values[slice(*span)] for name, values in columns.items()}) for span in _runs(changes)]
 
 
 def read_parameters(folder: Path | str) -> JsonObject:
     """Return the parameters of the walks in a folder; empty if there are none."""
     files = _files(Path(folder))
-    return _header(files[0])["parameters"] if files else {}
+    return _load(files[0])[0]["parameters"] if files else {}
 
 
 def stack_walks(walks: Sequence[Walk]) -> Record:
@@ -197,7 +178,7 @@ def segments(walks: Sequence[Walk], min_frames: int = 90, settle_frames: int = 2
 
 
 def _segments(walk: Walk, settle_frames: int) -> Iterator[Walk]:
-    good = walk.ok & ~walk.contact
+    good = walk.ok & ~walk.contact & finite.find_finite(walk)
     period = np.median(np.diff(walk.time)) if len(walk) > 1 else 0.0
     gap = np.diff(walk.time) > 1.5 * period
     changes = (np.diff(good) != 0) | (np.diff(walk.resets) != 0) | gap
@@ -213,34 +194,19 @@ def _runs(changes: np.ndarray) -> Iterator[tuple[int, int]]:
     yield from pairwise(bounds)
 
 
-def _table(record: Record, episode: int, rooms: Sequence[int], seed: int) -> pa.Table:
-    """Return the columns of a record; raise `InputError` if its shapes do not fit."""
-    robots, frames = np.shape(record.time)
-    if len(rooms) != robots:
-        raise InputError(f"episodes: expected a room for each of {robots} robots, got {len(rooms)}")
-    columns = {
-        "episode": np.full(robots * frames, episode, np.int32),
-        "robot": np.repeat(np.arange(robots, dtype=np.int32), frames),
-        "room": np.repeat(np.asarray(rooms, np.int32), frames),
-        "seed": np.full(robots * frames, seed, np.int64),
-    }
-    for name, field in FIELDS.items():
-        values = np.asarray(getattr(record, name))
-        if values.size != robots * frames * len(field.columns):
-            raise InputError(
-                f"episodes {name}: expected {len(field.columns)} numbers a frame for {robots} robots and "
-                f"{frames} frames, got shape {values.shape}"
-            )
-        values = values.reshape(robots * frames, len(field.columns))
-        columns |= {column: values[:, k] for k, column in enumerate(field.columns)}
-    return pa.table(columns)
-
-
-def _walk(columns: Mapping[str, np.ndarray], frames: slice) -> Walk:
-    episode, robot, room, seed = (int(columns[name][frames][0]) for name in ORIGIN)
+def _walk(folder: Path | str, columns: Mapping[str, np.ndarray]) -> Walk:
+    """Return the walk of some rows; raise `InputError` unless its frames follow each other, in one room."""
+    episode, robot, room, seed = (int(columns[name][0]) for name in ORIGIN)
+    backward, time = np.flatnonzero(~(np.diff(columns["time"]) > 0)), columns["time"]
+    if len(backward) or np.ptp(columns["room"]) or np.ptp(columns["seed"]):
+        found = f"time {time[backward[0] + 1]:g} after {time[backward[0]]:g}" if len(backward) else "several"
+        raise InputError(
+            f"{folder}: expected increasing time and one room of robot {robot} in episode {episode}, got {found}; "
+            "is a chunk there twice? collect again"
+        )
     arrays: dict[str, np.ndarray] = {}
     for name, field in FIELDS.items():
-        values = [columns[column][frames] for column in field.columns]
+        values = [columns[column] for column in field.columns]
         arrays[name] = np.stack(values, axis=1) if len(values) > 1 else values[0]
     arrays["joints"] = arrays["joints"].reshape(-1, 6, 3)
     return Walk(episode=episode, robot=robot, room=room, seed=seed, **arrays)
@@ -257,52 +223,63 @@ def _tables(folder: Path, parameters: JsonObject | None) -> list[pa.Table]:
     for number, path in enumerate(_files(folder)):
         if path.name != f"chunk-{number:05d}.parquet":
             raise InputError(f"{folder}: expected chunk-{number:05d}.parquet, got {path.name}; a chunk is missing")
-        header = _header(path)
+        header, table = _load(path)
         found = header["parameters"]
         expected = found if expected is None else expected
         if found != expected:
             raise InputError(
                 f"{path}: expected walks of the same settings, got {_differences(expected, found)}; use another folder"
             )
-        tables.append(_read(path, header["version"]))
+        tables.append(_with_present_columns(table, header["version"], path))
     return tables
 
 
-def _header(path: Path) -> JsonObject:
-    """Return the checked header of a chunk."""
+def _load(path: Path) -> tuple[JsonObject, pa.Table]:
+    """Return the checked header and the table of a chunk."""
     try:
-        text = (pq.read_schema(path).metadata or {}).get(b"lgmdjax")
-    except (OSError, pa.ArrowException) as error:
-        raise _damaged(path, error) from error
-    header = json.loads(text) if text else {}
-    if header.get("format") != FORMAT:
+        content = pa.BufferReader(checksums.read_bytes(path))
+        with pq.ParquetFile(content, page_checksum_verification=True) as file:
+            header = _check_header(path, file.schema_arrow.metadata or {})
+            if file.metadata.num_rows > episode_tables.MAX_ROWS:  # before memory is asked for
+                raise checksums.ChecksumError(f"{file.metadata.num_rows} rows")
+            table = file.read()
+        if header.get(checksums.SEAL) not in (None, episode_tables.digest(table, header)):
+            raise checksums.ChecksumError("another checksum in its header")
+    except InputError:
+        raise
+    except Exception as error:  # whatever a damaged file makes Arrow raise
+        line = one_line(error)[:200]
+        raise InputError(
+            f"{path}: expected a whole Parquet file, got: {line}; remove it, or collect it again"
+        ) from error
+    return header, table
+
+
+def _check_header(path: Path, metadata: Mapping[bytes, bytes]) -> JsonObject:
+    """Return the header of a chunk; raise `InputError` for one of another kind or version."""
+    try:
+        header = json.loads(metadata.get(b"lgmdjax", b"{}"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected a header in JSON, got {one_line(error)}; collect it again") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"{path}: expected recorded walks, got Parquet of another kind; move it elsewhere")
-    if header.get("version") not in RENAMED:
+    if not isinstance(header.get("version"), int) or header["version"] not in RENAMED:
         readable = " or ".join(map(str, RENAMED))
         raise InputError(
             f"{path}: expected walks of version {readable}, got {header.get('version')}; collect them again"
         )
+    schema.check(HEADER, header, f"{path}: header", "collect it again")
     return header
 
 
-def _read(path: Path, version: int) -> pa.Table:
+def _with_present_columns(table: pa.Table, version: int, path: Path) -> pa.Table:
     """Return the columns of a chunk of some version, under their present names."""
-    try:
-        table = pq.read_table(path, page_checksum_verification=True)
-    except (OSError, pa.ArrowException) as error:
-        raise _damaged(path, error) from error
     table = table.rename_columns([RENAMED[version].get(name, name) for name in table.column_names])
     if version in NEAREST_ONLY:
         for side in SIDES:
-            table = table.append_column(f"corridor_{side}", table[f"distance_{side}"])
-    if missing := set(COLUMNS) - set(table.column_names):
-        raise InputError(f"{path}: expected all columns, got none called {min(missing)}; collect it again")
-    return table.select(COLUMNS)
-
-
-def _damaged(path: Path, error: Exception) -> InputError:
-    line = str(error).split("\n")[0]
-    return InputError(f"{path}: expected a whole Parquet file, got: {line}; remove it, or collect it again")
+            if f"distance_{side}" in table.column_names:
+                table = table.append_column(f"corridor_{side}", table[f"distance_{side}"])
+    return episode_tables.check(table, path)
 
 
 def _differences(expected: JsonObject, found: JsonObject) -> str:

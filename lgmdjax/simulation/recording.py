@@ -11,6 +11,7 @@ from tqdm import tqdm
 from lgmdjax.body import hexapod
 from lgmdjax.control import policies
 from lgmdjax.control.names import PolicyName
+from lgmdjax.runtime import interruption
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import closed_loop, episodes
@@ -84,6 +85,7 @@ def rollout_with_progress(
     frames, second = robots * round(seconds * closed_loop.FRAME_RATE), 1 / closed_loop.FRAME_RATE
     with tqdm(total=frames, desc=label, unit="robot-s", unit_scale=second, bar_format=PROGRESS_FORMAT) as bar:
         for chunk in chunks:
+            interruption.check()
             bar.update(chunk.time.size)
             yield chunk
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool
 
 from lgmdjax.control.policies import Policy
 from lgmdjax.runtime.mjx import mjx
-from lgmdjax.simulation import closed_loop
+from lgmdjax.simulation import closed_loop, finite
 from lgmdjax.simulation.closed_loop import Params, Record, Room, State
 from lgmdjax.simulation.sharding import shard_robots
 
@@ -112,14 +112,16 @@ def rollout_chunks(
 ) -> Iterator[Record]:
     """Roll out a batch of robots for `seconds`, yielding NumPy records of `chunk_seconds` one after the other.
 
-    One program is compiled for all chunks; the last one may run past the end and is cut.
+    One program is compiled for all chunks; the last one may run past the end and is cut. A frame that is not finite in
+    every field is not `ok`, and has zeros there (`lgmdjax.simulation.finite`).
     """
     frames = max(1, round(chunk_seconds * closed_loop.FRAME_RATE))
     total = round(seconds * closed_loop.FRAME_RATE)
     states = reset_batch(params, model, rooms, policy=policy)
     for done in range(0, total, frames):
         states, record = rollout_batch(params, model, rooms, states, policy=policy, frames=frames, render=render)
-        yield jax.tree.map(lambda leaf, left=total - done: np.asarray(leaf)[:, :left], record)
+        chunk = jax.tree.map(lambda leaf, left=total - done: np.asarray(leaf)[:, :left], record)
+        yield finite.flag_nonfinite(chunk)
 
 
 def concatenate_time(records: list[Record]) -> Record:

@@ -183,7 +183,7 @@ def fit_methods(
             row = {"method": method, "repeat": repeat, "seconds": time.monotonic() - began, "curve": curve}
             metrics = {"train": score(best, *train), "test": score(best, *test)}
             storage.write_json(path, row | metrics | {"detector": detector_constants(best.detector)})
-    return [storage.read_json(path) for path in paths]
+    return [storage.read_table(path) for path in paths]
 
 
 def fit_navigator(

@@ -16,7 +16,7 @@ def test_no_check_fails_on_this_machine(tmp_path: Path, capsys: pytest.CaptureFi
     code = doctor.run_checks(tmp_path)
     lines = capsys.readouterr().out.splitlines()
     assert code == 0, lines
-    assert len(lines) == 8
+    assert len(lines) == 9
     assert all(line.startswith(("OK ", "WARN")) for line in lines)
 
 
@@ -67,9 +67,8 @@ def test_a_failing_check_is_one_line_and_exit_code_1(
     monkeypatch.setattr(hexapod, "load", fail)
     assert doctor.run_checks(tmp_path) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert [line for line in lines if line.startswith("FAIL")] == [
-        "FAIL  physics     InputError: expected the robot, got nothing"
-    ]
+    (failed,) = [line for line in lines if line.startswith("FAIL")]
+    assert failed.startswith("FAIL  physics      InputError: expected the robot, got nothing")
 
 
 def test_physics_that_cannot_be_imported_is_one_line(
@@ -77,7 +76,7 @@ def test_physics_that_cannot_be_imported_is_one_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "lgmdjax.runtime.mjx", None)
     assert main.main(["doctor", "--out", str(tmp_path)]) == 1
-    assert "FAIL  physics     ModuleNotFoundError" in capsys.readouterr().out
+    assert "FAIL  physics      ModuleNotFoundError" in capsys.readouterr().out
 
 
 def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
@@ -93,3 +92,22 @@ def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(doctor, "ENOUGH_GB", enough)
         monkeypatch.setattr(doctor, "MIN_GB", minimum)
         assert doctor.disk(tmp_path).level == level
+
+
+def test_variables_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "x")
+
+    def fail() -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(hexapod, "load", fail)
+    assert doctor.run_checks(tmp_path) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert any(
+        line.startswith("FAIL  environment") and "JAX_NUM_CPU_DEVICES" in line and "'x'" in line for line in lines
+    )
+    assert any(
+        line.startswith("FAIL  physics      AssertionError") and "JAX_NUM_CPU_DEVICES='x'" in line for line in lines
+    )

@@ -214,12 +214,15 @@ def test_export_lists_its_files_and_replaces_none(tmp_path: Path, capsys: pytest
 
 
 def test_an_interruption_is_exit_code_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(out: Path) -> int:
+    def interrupted(*_: object) -> int:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("lgmdjax.cli.doctor.run_checks", interrupted)
     assert main.main(["doctor"]) == 130
-    assert "the same command resumes" in capsys.readouterr().err
+    assert capsys.readouterr().err == "lgmdjax: interrupted; the same command starts again\n"
+    monkeypatch.setattr("lgmdjax.cli.flags.parse_trial", interrupted)
+    assert main.main(["trial"]) == 130
+    assert capsys.readouterr().err == "lgmdjax: interrupted; the same command resumes\n"
 
 
 def test_the_exit_code_of_a_command_is_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,9 +1,14 @@
 """Gait metrics of trajectories with known speed, turning and sway."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from lgmdjax.errors import InputError
 from lgmdjax.evaluation import gait_test
+from lgmdjax.pipeline import fit_gait
+from lgmdjax.pipeline.settings import FitGaitSettings
 
 CYCLE = 1.0  # s
 
@@ -88,3 +93,12 @@ def test_the_settling_time_is_left_out():
         feet=steady.feet,
     )
     assert gait_test.measure_gait(mixed, CYCLE) == gait_test.measure_gait(steady, CYCLE)
+
+
+def test_a_walk_without_a_whole_cycle_is_refused():
+    least = gait_test.SETTLING_TIME + CYCLE + gait_test.TIME_STEP
+    gait_test.measure_gait(trajectory(0.05, seconds=least), CYCLE)
+    with pytest.raises(InputError, match=r"expected walks of .* s or more to measure a gait, got 3 s"):
+        gait_test.measure_gait(trajectory(0.05, seconds=3.0), CYCLE)
+    with pytest.raises(InputError, match=r"got 3 s; walk longer"):
+        fit_gait.run(Path("nowhere"), {}, FitGaitSettings(steps=1, seconds=3), 0)

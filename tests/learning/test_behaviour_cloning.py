@@ -348,5 +348,5 @@ def test_missing_and_non_finite_data_are_refused(data):
     with pytest.raises(InputError, match="expected frames to test on, got none"):
         behaviour_cloning.fit(params, train, [], show_progress=False)
     broken = [replace(train[0], u=np.full_like(train[0].u, np.nan))]
-    with pytest.raises(InputError, match="expected finite u and v to train on"):
+    with pytest.raises(InputError, match="expected finite walks to train on"):
         behaviour_cloning.fit(params, broken, train, show_progress=False)

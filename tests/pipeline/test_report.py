@@ -191,6 +191,22 @@ def test_a_rate_without_an_interval_has_a_dash(copy: Path):
     assert "0.31 – to –" in text_of(copy)
 
 
+def test_names_and_texts_of_a_run_are_shown_as_text(copy: Path):
+    """They are data: none becomes a tag, an attribute or a script of the page."""
+    hostile = ["<script>alert(1)</script>", "\"><img src=x onerror='alert(1)'>", "line\nbreak\x1b[2J", "x" * 300]
+    facts = json.loads((copy / "run.json").read_text())
+    rewrite(
+        copy, "run.json", scale=hostile[0], settings=facts["settings"] | {"report": dict.fromkeys(hostile, hostile[1])}
+    )
+    rewrite(copy, "train/done.json", device=hostile[1], versions={hostile[0]: hostile[1], "jax": hostile[3]})
+    path = report.render(copy, room=synthetic.room())
+    source = path.read_text(encoding="utf-8")
+    page = Page(source)
+    assert not page.open and "<script" not in source
+    assert not any(name.startswith("on") or value == "x" for _, name, value in page.attributes)
+    assert hostile[0] in page.text and hostile[3] in page.text
+
+
 @pytest.mark.parametrize(
     ("name", "command"),
     [

@@ -69,9 +69,7 @@ def test_the_robot_moves_in_the_video(decoded: tuple[list[np.ndarray], float]):
 
 def test_the_image_is_dimmed_outside_the_hemifield(walk: walk_video.WalkTrace):
     white = np.full((2, 60, 80), 250, np.uint8)
-    page = walk_video._Page(walk, np.arange(60), (80, 60)).compose(
-        np.zeros((100, 160, 3), np.uint8), white, 0, overlap=0.6
-    )
+    page = walk_video._Page(walk, np.arange(60), (80, 60)).compose(np.zeros((100, 160, 3), np.uint8), white, 0, EYES)
     for (x, y, width, _), first, last in zip(walk_video.EYE_BOXES, (0.0, 0.4), (0.6, 1.0), strict=True):
         row, across = page[y + 50, x : x + width, 0], np.arange(width) / width
         assert np.all(row[(across > first + 0.03) & (across < last - 0.03)] == 250)

@@ -107,10 +107,13 @@ def test_another_version_of_a_stage_runs_it(pipeline: Pipeline, run: Run) -> Non
     assert pipeline.ran[-1] == "left"
 
 
-@pytest.mark.parametrize("damage", ["lost", "cut", "stamp"])
+@pytest.mark.parametrize("damage", ["lost", "cut", "stamp", "seal"])
 def test_a_damaged_stage_runs_again(pipeline: Pipeline, run: Run, damage: str) -> None:
     pipeline.execute(run)
-    if damage == "stamp":
+    if damage == "seal":
+        path = run.folder / "right" / "done.json"
+        path.write_text(path.read_text().replace('"seconds": ', '"seconds": 1'))
+    elif damage == "stamp":
         (run.folder / "right" / "done.json").write_text('{"fingerpr')
     elif damage == "cut":
         (run.folder / "right" / "value.txt").write_text("")
@@ -118,6 +121,43 @@ def test_a_damaged_stage_runs_again(pipeline: Pipeline, run: Run, damage: str) -
         (run.folder / "right" / "value.txt").unlink()
     assert pipeline.execute(run) == ["right"]
     assert (run.folder / "right" / "value.txt").read_text() == "15"
+
+
+def test_a_stage_with_another_number_in_a_file_runs_again(
+    pipeline: Pipeline, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its size is the same."""
+    pipeline.execute(run)
+    (run.folder / "right" / "value.txt").write_text("95")
+    assert pipeline.execute(run) == ["right"]
+    assert "right: done again, because" in capsys.readouterr().out
+    assert (run.folder / "right" / "value.txt").read_text() == "15"
+
+
+def test_a_stage_of_a_version_without_checksums_is_judged_by_sizes(pipeline: Pipeline, run: Run) -> None:
+    pipeline.execute(run)
+    path = run.folder / "right" / "done.json"
+    stamp = json.loads(path.read_text())
+    del stamp["sha256"]
+    path.write_text(json.dumps(stamp | {"files": {"value.txt": 2}}))
+    assert pipeline.execute(run) == []
+    path.write_text(json.dumps(stamp | {"files": {"value.txt": 3}}))
+    assert pipeline.execute(run) == ["right"]
+
+
+def test_a_stage_that_was_killed_before_done_json_got_its_name_is_not_repeated(pipeline: Pipeline, run: Run) -> None:
+    pipeline.execute(run)
+    fingerprint = json.loads((run.folder / "right" / "done.json").read_text())["fingerprint"]
+    partial = (run.folder / "right").rename(run.folder / f"right.partial-{fingerprint}")
+    (partial / "done.json").rename(partial / "done.json.123.partial")
+    assert pipeline.execute(run) == []
+    assert sorted(path.name for path in (run.folder / "right").iterdir()) == ["done.json", "value.txt"]
+    partial = (run.folder / "right").rename(run.folder / f"right.partial-{fingerprint}")
+    content = (partial / "done.json").read_bytes()
+    (partial / "done.json").unlink()
+    (partial / "done.json.123.partial").write_bytes(content[:-20])
+    assert pipeline.execute(run) == ["right"]
+    assert sorted(path.name for path in (run.folder / "right").iterdir()) == ["done.json", "value.txt"]
 
 
 def test_a_stage_with_additional_files_is_up_to_date(pipeline: Pipeline, run: Run) -> None:
@@ -221,7 +261,7 @@ def test_settings_are_recorded(run: Run) -> None:
 def test_a_folder_of_another_format_is_refused(tmp_path: Path, run: Run, change: int, maker: str) -> None:
     path = run.folder / "run.json"
     made = json.loads(path.read_text())
-    path.write_text(json.dumps({"format": run_folders.FORMAT + change, "scale": made["scale"]}))
+    path.write_text(json.dumps({"format": run_folders.FORMAT + change, "settings": made["settings"]}))
     with pytest.raises(InputError, match=f"made by an? {maker} lgmdjax; .*--run; choose another --name") as caught:
         open_run(tmp_path, "try", "smoke", 5, SETTINGS)
     assert "\n" not in str(caught.value)
@@ -230,7 +270,7 @@ def test_a_folder_of_another_format_is_refused(tmp_path: Path, run: Run, change:
 @pytest.mark.parametrize("content", ["", '{"format": 2', "[]", '{"format": 2}', '{"format": "two"}', "{}"])
 def test_unreadable_settings_are_refused(tmp_path: Path, run: Run, content: str) -> None:
     (run.folder / "run.json").write_text(content)
-    with pytest.raises(InputError, match=r"run\.json.*cannot be read"):
+    with pytest.raises(InputError, match=r"run\.json.*(cannot be read|expected .*, got .*; delete the folder)"):
         open_run(tmp_path, "try", "smoke", 5, SETTINGS)
 
 
@@ -241,7 +281,22 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
             open_run(out, "try", "smoke", 0, SETTINGS)
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "..", "/tmp"])
+def test_messages_name_what_the_command_offers(tmp_path: Path) -> None:
+    def make(scale: str) -> Run:
+        return open_run(tmp_path, "tube-learned-0", scale, 5, SETTINGS, remedy="choose another --out")
+
+    run = make("trial")
+    with pytest.raises(InputError, match="choose another --out, or delete the folder"):
+        make("study")
+
+    def work(folder: Path, inputs: Mapping[str, Path], settings: Number, seed: int) -> None:
+        with pytest.raises(InputError, match=r"wait, or choose another --out$"):
+            execute(run, [Stage(name="right", run=work)], "right")
+
+    execute(run, [Stage(name="left", run=work)], "left")
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "..", "/tmp", "a\x1b[2J", "a\nb"])
 def test_a_name_with_a_path_in_it_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="plain folder name"):
         open_run(tmp_path, name, "smoke", 0, SETTINGS)

@@ -1,15 +1,20 @@
 """Robots from files: their policies, camera and fingerprint."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
 
 from lgmdjax.control import navigator, policies
 from lgmdjax.control.names import POLICY_NAMES
 from lgmdjax.errors import InputError
+from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly
 
@@ -64,3 +69,100 @@ def test_a_folder_without_the_files_of_its_stage_is_refused(tmp_path):
         assembly.load_robot(train_folder=tmp_path)
     with pytest.raises(InputError, match="expected"):
         assembly.load_robot(gait_folder=tmp_path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with files of the pretrained robot, which the tests change; without checksums, as older ones."""
+    for name in ("controller.safetensors", "shaping.safetensors", "baselines.npz"):
+        shutil.copy(PRETRAINED_DIR / name, tmp_path)
+    return tmp_path
+
+
+def rewrite_controller(folder, header=(), tensors=()):
+    """Write the controller again as another program would."""
+    path = folder / "controller.safetensors"
+    with safe_open(path, framework="numpy") as file:
+        metadata = file.metadata() | {name: json.dumps(value) for name, value in dict(header).items()}
+    arrays = load_file(path) | dict(tensors)
+    save_file(arrays, path, {name: text for name, text in metadata.items() if text != "null"})
+
+
+EYES = {"width": 80, "height": 60, "overlap": 0.5, "pooling": 3}
+LGMD = {"threshold": 0.1, "suppression": 5.0, "inhibition": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        *(({"eyes": EYES | {"pooling": value}}, "eyes.pooling: expected an integer") for value in (0, 7.5, 10_000)),
+        ({"eyes": EYES | {"pooling": 1000}}, "pooling"),
+        ({"eyes": EYES | {"width": 10**9}}, "eyes.width: expected an integer of 1 to 4096"),
+        ({"eyes": EYES | {"overlap": "half"}}, "eyes.overlap"),
+        ({"eyes": []}, "header.eyes: expected an object"),
+        ({"eyes": None}, "header: expected an object with eyes"),
+        *(
+            ({"lgmd": LGMD | {"threshold": value}}, "lgmd.threshold: expected a finite number")
+            for value in ([1], "1", True, -1, 1e999)
+        ),
+        ({"symmetric": "yes"}, "header.symmetric: expected true or false, got 'yes'"),
+        ({"units": 10**9}, "header.units: expected an integer"),
+        ({"variant": ["lstm"]}, "header.variant: expected one of"),
+        ({"variant": None}, "header: expected an object with variant"),
+    ],
+)
+def test_a_controller_with_another_header_is_refused(folder, header, words):
+    rewrite_controller(folder, header)
+    with pytest.raises(InputError, match=words) as caught:
+        assembly.load_robot(folder, folder)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("tensors", "words"),
+    [
+        ({"input_scale": np.zeros(2, np.float32)}, "input_scale: expected finite floats of 1e-06"),
+        ({"output_scale": np.array([1, -1], np.float32)}, "output_scale"),
+        ({"input_mean": np.zeros(2, np.int64)}, "input_mean: .*got int64"),
+        ({"input_mean": np.full(2, 1e38, np.float32)}, "input_mean"),
+    ],
+)
+def test_a_controller_with_other_weights_is_refused(folder, tensors, words):
+    rewrite_controller(folder, tensors=tensors)
+    with pytest.raises(InputError, match=words):
+        assembly.load_robot(folder, folder)
+
+
+GAIN, REPLAYED = np.asarray(5.0), np.ones((assembly.REPLAY_LENGTH, 2))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        ({}, "expected an object with gain, replayed"),
+        ({"gain": np.asarray(np.nan), "replayed": REPLAYED}, "baselines.npz.gain: expected a finite|finite floats"),
+        ({"gain": np.asarray("5"), "replayed": REPLAYED}, "gain"),
+        ({"gain": np.ones(1), "replayed": REPLAYED}, "gain"),
+        ({"gain": GAIN, "replayed": np.ones((4096, 3))}, r"replayed: .* got float64 of shape \(4096, 3\)"),
+        ({"gain": GAIN, "replayed": REPLAYED[:0]}, "replayed"),
+        ({"gain": GAIN, "replayed": np.where(REPLAYED == 1, np.nan, 0)}, "replayed"),
+    ],
+)
+def test_other_baselines_are_refused(folder, arrays, words):
+    np.savez(folder / "baselines.npz", **arrays)
+    with pytest.raises(InputError, match=words):
+        assembly.load_robot(folder, folder)
+
+
+@pytest.mark.parametrize("value", [[0.25], "0.25", True, 1e999, -1, None, 10**400])
+def test_a_calibration_with_another_threshold_is_refused(tmp_path, value):
+    (tmp_path / "calibration.json").write_text(json.dumps(LGMD | {"threshold": value}))
+    with pytest.raises(InputError, match="threshold: expected a finite number"):
+        assembly.load_detector(tmp_path)
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "{}", '{"threshold": 1}'])
+def test_a_calibration_of_another_form_is_refused(tmp_path, content):
+    (tmp_path / "calibration.json").write_text(content)
+    with pytest.raises(InputError, match="expected an object with threshold, suppression, inhibition"):
+        assembly.load_detector(tmp_path)

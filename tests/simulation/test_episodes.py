@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -189,6 +190,8 @@ def test_files_of_another_kind_or_version_are_refused(tmp_path):
     header = json.loads(table.schema.metadata[b"lgmdjax"])
     pq.write_table(table.replace_schema_metadata({"lgmdjax": json.dumps(header | {"version": 0})}), path)
     refused(tmp_path, "expected walks of version 1 or 2 or 3, got 0")
+    del header["sha256"]
+    table = table.replace_schema_metadata({"lgmdjax": json.dumps(header)})
     pq.write_table(table.drop_columns("u_left"), path)
     refused(tmp_path, "got none called u_left")
     pq.write_table(pa.table({"u": [1.0]}), path)
@@ -216,3 +219,179 @@ def test_records_of_a_wrong_shape_are_refused(tmp_path):
     file.write_text("")
     with pytest.raises(InputError, match="expected a folder to write to"):
         episodes.Writer(file, SETTINGS)
+
+
+def rewrite(folder, change, *, sealed=False, version=episodes.VERSION):
+    """Write a chunk again as another program would: `change` gets its columns; without a checksum in the header."""
+    path = folder / "chunk-00000.parquet"
+    table = pq.read_table(path)
+    header = json.loads(table.schema.metadata[b"lgmdjax"]) | {"version": version}
+    if not sealed:
+        del header["sha256"]
+    columns = {name: table[name] for name in table.column_names}
+    changed = change(columns) or columns
+    pq.write_table(pa.table(changed).replace_schema_metadata({"lgmdjax": json.dumps(header)}), path)
+
+
+def as_type(name, values):
+    return lambda columns: columns.update({name: pa.array([values] * len(columns[name]))})
+
+
+def with_value(name, row, value):
+    def change(columns):
+        values = columns[name].to_numpy().copy()
+        values[row] = value
+        columns[name] = pa.array(values)
+
+    return change
+
+
+def rows(selected):
+    return lambda columns: {name: column.take(pa.array(selected, pa.int64())) for name, column in columns.items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (as_type("x", "1"), "floats in column x, got string"),
+        (as_type("x", [1.0]), "floats in column x, got list"),
+        (as_type("x", None), "floats in column x, got null"),
+        (as_type("u_left", 1), "floats in column u_left, got int64"),
+        (as_type("ok", 1), "booleans in column ok, got int64"),
+        (as_type("resets", 1.0), "integers in column resets, got double"),
+        (as_type("robot", True), "integers in column robot, got bool"),
+        (lambda columns: columns.update(x=pa.array([None, *range(1, 40)], pa.float32())), "float with 1 nulls"),
+        (with_value("x", 3, np.nan), "in frames that are ok, got x nan of robot 0 in row 3"),
+        (with_value("time", 22, np.nan), "got time nan of robot 1 in row 22"),
+        (with_value("clearance", 3, np.inf), "got clearance inf"),
+        (with_value("distance_left", 3, -np.inf), "got distance_left -inf"),
+        (with_value("joint_17", 3, 1e38), "got joint_17"),
+        (with_value("resets", 3, -1), "got resets -1"),
+        (with_value("time", 3, 0.0), "increasing time and one room of robot 0 in episode 0, got time 0 after"),
+        (with_value("room", 3, 9), "one room of robot 0"),
+        (with_value("seed", 3, 9), "one room of robot 0"),
+        (rows([]), "expected 1 to 10000000 rows"),
+        (rows([*range(20), *range(20)]), "increasing time"),
+        (rows(range(19, -1, -1)), "increasing time"),
+    ],
+)
+def test_walks_that_no_robot_recorded_are_refused(tmp_path, change, words):
+    write(tmp_path, record())
+    rewrite(tmp_path, change)
+    refused(tmp_path, words)
+
+
+@pytest.mark.parametrize(
+    "change", [rows(range(10)), rows([0]), with_value("u_left", 3, 0.7), with_value("contact", 3, True)]
+)
+def test_other_numbers_than_were_written_are_refused(tmp_path, change):
+    """Each is a sound walk, so that only the checksum tells."""
+    write(tmp_path, record())
+    rewrite(tmp_path, change)
+    episodes.read(tmp_path)
+    shutil.rmtree(tmp_path)
+    write(tmp_path, record())
+    rewrite(tmp_path, change, sealed=True)
+    refused(tmp_path, "another checksum in its header")
+
+
+def test_a_chunk_that_is_there_twice_is_refused(tmp_path):
+    write(tmp_path, record())
+    shutil.copy(tmp_path / "chunk-00000.parquet", tmp_path / "chunk-00001.parquet")
+    refused(tmp_path, "is a chunk there twice")
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (b"{", "expected a header in JSON"),
+        (b"[" * 100_000, "expected a header in JSON"),
+        (b"[]", "another kind"),
+        (b'{"format": "lgmdjax episodes", "version": 3}', "header: expected an object with format, parameters"),
+        (b'{"format": "lgmdjax episodes", "version": 3, "parameters": []}', "header.parameters: expected an object"),
+        (b'{"format": "lgmdjax episodes", "version": [3], "parameters": {}}', "expected walks of version"),
+        (b'{"format": "lgmdjax episodes", "version": 3, "parameters": {}, "sha256": 1}', "header.sha256"),
+    ],
+)
+def test_headers_of_another_form_are_refused(tmp_path, header, words):
+    write(tmp_path, record())
+    path = tmp_path / "chunk-00000.parquet"
+    pq.write_table(pq.read_table(path).replace_schema_metadata({"lgmdjax": header}), path)
+    refused(tmp_path, words)
+    with pytest.raises(InputError, match=words):
+        episodes.read_parameters(tmp_path)
+
+
+def test_frames_that_are_not_ok_may_lack_numbers_in_older_files(tmp_path):
+    """They are read as zero, so that no sum over frames becomes nan."""
+    write(tmp_path, record())
+
+    def lose(columns):
+        with_value("ok", 5, False)(columns)
+        with_value("clearance", 5, np.nan)(columns)
+
+    rewrite(tmp_path, lose)
+    walk = episodes.read(tmp_path)[0]
+    assert walk.clearance[5] == 0.0 and not walk.ok[5] and np.isfinite(walk.clearance).all()
+    assert [len(segment) for segment in episodes.segments([walk], min_frames=1, settle_frames=0)] == [5, 14]
+
+
+def test_segments_have_no_frame_that_is_not_finite(tmp_path):
+    write(tmp_path, record())
+    walk = episodes.read(tmp_path)[0]
+    joints = walk.joints.copy()
+    joints[5, 2, 1] = np.nan
+    walk = replace(walk, joints=joints)
+    assert [len(segment) for segment in episodes.segments([walk], min_frames=1, settle_frames=0)] == [5, 14]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"u": "dark"}, "episodes u: .* got shape"),
+        ({"time": 3.0}, "episodes time"),
+        ({"u": np.zeros((2, 2, 20))}, r"got shape \(2, 2, 20\)"),
+        ({"joints": np.zeros((2, 20, 18))}, "expected 18 numbers a frame"),
+        ({"clearance": np.zeros((2, 20), complex)}, "clearance: expected floats, got complex128"),
+        ({"clearance": np.zeros((2, 20), int)}, "clearance: expected floats, got int64"),
+        ({"clearance": np.zeros((2, 20), np.float16)}, "clearance: expected floats, got float16"),
+        ({"ok": np.ones((2, 20))}, "ok: expected booleans, got float64"),
+        ({"resets": np.zeros((2, 20))}, "resets: expected integers, got float64"),
+        ({"clearance": None}, "episodes clearance"),
+        ({"clearance": [[1.0], [1.0, 2.0]]}, "episodes clearance: expected an array"),
+        ({"clearance": np.full((2, 20), np.nan)}, "got clearance nan of robot 0, frame 0"),
+    ],
+)
+def test_records_of_other_types_are_refused(tmp_path, changes, words):
+    with pytest.raises(InputError, match=words):
+        write(tmp_path, replace(record(), **changes), rooms=range(2))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("walk", "words"),
+    [
+        ({"seed": 2**63}, "seed: expected an integer of 0 to"),
+        ({"seed": "7"}, "seed: expected an integer"),
+        ({"seed": -1}, "seed: expected an integer"),
+        ({"episode": 2**31}, "episode: expected an integer"),
+        ({"episode": 1.5}, "episode: expected an integer"),
+        ({"rooms": [0, 2**31]}, "room: expected an integer"),
+        ({"settings": {"f": print}}, "expected JSON values"),
+        ({"settings": {"f": float("nan")}}, "expected JSON values"),
+        ({"settings": [1]}, "parameters: expected an object"),
+    ],
+)
+def test_other_origins_are_refused(tmp_path, walk, words):
+    with pytest.raises(InputError, match=words):
+        write(tmp_path, record(), **walk)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_record_without_a_field_is_refused(tmp_path):
+    writer = episodes.Writer(tmp_path, SETTINGS)
+    with pytest.raises(InputError, match="episodes position: expected an array"):
+        writer.write(SimpleNamespace(time=np.zeros((2, 20))), episode=0, rooms=[0, 1], seed=0)  # pyright: ignore

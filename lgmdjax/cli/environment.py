@@ -1,0 +1,64 @@
+"""Start the libraries that read environment variables, and say in one line which of them does not start, and why."""
+
+from collections.abc import Callable
+
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import jax_setup
+
+
+def start_jax() -> None:
+    """Make JAX check what it reads from its cache; raise `InputError` for variables that JAX can't be started with."""
+    jax_setup.check_variables()
+    from lgmdjax.runtime import program_cache
+
+    program_cache.protect()
+
+
+def check() -> None:
+    """Raise `InputError` if a library does not start here; the message names variables and values. Takes seconds."""
+    jax_setup.check_variables()
+    for name, start in LIBRARIES.items():
+        try:
+            start()
+        except Exception as error:  # whatever a library makes of a variable that it does not understand
+            reason, variables = one_line(error)[:300] or type(error).__name__, jax_setup.user_variables()
+            advice = f"change or unset {variables}" if variables else "install lgmdjax and what it needs again"
+            raise InputError(f"expected an environment in which {name} starts, got {reason}; {advice}") from error
+
+
+def explain(error: Exception) -> str:
+    """Return what is wrong with the environment; empty if it is not the environment that an error comes from."""
+    if type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error):
+        return f"expected more memory, got {one_line(error)[:200]}; run fewer robots at once"
+    if isinstance(error, RuntimeError) and "start new thread" in str(error):
+        return f"expected to start a thread, got {one_line(error)}; allow more processes or memory (ulimit)"
+    try:
+        check()
+    except InputError as fault:
+        return str(fault)
+    return ""
+
+
+def _start_jax() -> None:
+    import jax
+
+    jax.devices()
+
+
+def _start_mujoco() -> None:
+    import mujoco
+
+    mujoco.MjModel.from_xml_string("<mujoco/>")
+
+
+def _start_matplotlib() -> None:
+    import matplotlib.rcsetup
+
+    matplotlib.rcsetup.validate_backend(matplotlib.rcParams["backend"])
+
+
+LIBRARIES: dict[str, Callable[[], None]] = {
+    "JAX": _start_jax,
+    "MuJoCo": _start_mujoco,
+    "Matplotlib": _start_matplotlib,
+}

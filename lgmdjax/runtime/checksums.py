@@ -1,0 +1,108 @@
+"""Checksums (SHA-256) of files: one that is not as it was written is refused, instead of read as other numbers.
+
+| what                         | its checksum is                                                                   |
+| ---------------------------- | --------------------------------------------------------------------------------- |
+| a file of a finished stage   | in the `files` of the stage's done.json                                           |
+| a file of lgmdjax/data       | in lgmdjax/data/done.json, which the experiments that train the weights write     |
+| done.json, run.json          | in themselves (`seal`)                                                            |
+| safetensors, Parquet         | in their own headers too, so that a copy elsewhere is checked                     |
+| a checkpoint                 | beside the identity of its fit (`lgmdjax.learning.checkpoints`)                   |
+| a cached program             | at the end of its file (`program_cache`), on its first line (`export_cache`)      |
+
+Files of versions before 0.3.0 have none, and are read without this check: their done.json lists sizes.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+STAMP = "done.json"
+SEAL = "sha256"  # name of a document's own checksum
+PARTIAL = (".partial", ".part")  # suffixes of files that were not finished; version 0.1.0 wrote .part
+MAX_DEPTH = 3  # folders from a file up to the one whose done.json lists it
+
+
+class ChecksumError(ValueError):
+    """A file that is not as it was written."""
+
+
+def digest(*parts: bytes) -> str:
+    """Return the SHA-256 of some bytes, in hexadecimal digits.
+
+    >>> digest(b"lgmd")[:8]
+    'd5f4d3c6'
+    """
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(part)
+    return total.hexdigest()
+
+
+def seal(content: Mapping[str, object]) -> dict[str, Any]:
+    """Return a JSON object with its own checksum.
+
+    >>> is_sealed(seal({"seed": 1})), is_sealed(seal({"seed": 1}) | {"seed": 2}), is_sealed({"seed": 1})
+    (True, False, False)
+    """
+    return {**content, SEAL: _digest_json(content)}
+
+
+def is_sealed(content: object) -> bool:
+    """Tell whether a JSON value is an object with its own checksum, and has not changed since."""
+    return isinstance(content, Mapping) and SEAL in content and content[SEAL] == _digest_json(content)
+
+
+def require_seal(content: object) -> None:
+    """Raise `ChecksumError` for a JSON object that has a checksum, but not its own."""
+    if isinstance(content, Mapping) and SEAL in content and not is_sealed(content):
+        raise ChecksumError("its checksum is not that of its contents")
+
+
+def list_files(folder: Path) -> dict[str, str]:
+    """Return the checksums of all results in a folder and below, by name; left-overs of killed processes are none."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix not in PARTIAL)
+    return {path.relative_to(folder).as_posix(): digest(path.read_bytes()) for path in files if path.name != STAMP}
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file; raise `ChecksumError` if a done.json in its folder or above has no or another checksum for it."""
+    content = path.read_bytes()
+    folder = next((folder for folder in list(path.parents)[:MAX_DEPTH] if (folder / STAMP).is_file()), None)
+    if folder is None or path == folder / STAMP:
+        return content
+    files = read_stamp(folder).files
+    name = path.relative_to(folder).as_posix()
+    if files is not None and files.get(name) != digest(content):
+        reason = "has another checksum than in" if name in files else "is not in"
+        raise ChecksumError(f"it {reason} {folder / STAMP}")
+    return content
+
+
+class Stamp(NamedTuple):
+    """The done.json of a finished stage, and the checksums of its files; None if an older version wrote it."""
+
+    facts: dict[str, Any]
+    files: dict[str, str] | None
+
+
+def read_stamp(folder: Path) -> Stamp:
+    """Read the done.json of a folder; raise `ChecksumError` for a damaged one."""
+    try:
+        facts = json.loads((folder / STAMP).read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise ChecksumError(f"{folder / STAMP} is no JSON") from error
+    files = facts.get("files", {}) if isinstance(facts, dict) else None
+    if not isinstance(files, dict):
+        raise ChecksumError(f"{folder / STAMP} lists no files")
+    is_older = SEAL not in facts and not any(isinstance(value, str) for value in files.values())
+    if not (is_older or is_sealed(facts)):
+        raise ChecksumError(f"the checksum of {folder / STAMP} is not that of its contents")
+    return Stamp(facts, None if is_older else files)
+
+
+def _digest_json(content: Mapping[str, object]) -> str:
+    """Return the checksum of a JSON object without its own, whatever the order of its keys."""
+    rest = {key: value for key, value in content.items() if key != SEAL}
+    return digest(json.dumps(rest, sort_keys=True).encode())

@@ -1,0 +1,81 @@
+"""Ctrl-C, SIGTERM and SIGHUP end a command within two seconds, whatever it is doing.
+
+Python answers a signal with an exception between two of its instructions. That is not enough: compiled code may run for
+minutes between two instructions, and an exception in a callback of the garbage collector, of which JAX has one, is
+printed and forgotten. So a signal also sets a flag, which loops over chunks of work look at (`check`), and wakes a
+thread that ends the process if nothing else did within `GRACE`. Files are safe in either case: they get their names
+when they are complete (`lgmdjax.runtime.partial_files`).
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+
+GRACE = 1.5  # s from a signal to the end of the process
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows lacks the last
+
+_received: list[int] = []  # signals that were not obeyed yet
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal that ends the command."""
+
+    def __init__(self, number: int):
+        super().__init__(signal.Signals(number).name)
+        self.exit_code = 128 + number
+
+
+def check() -> None:
+    """Raise `Interrupted` if a signal came whose exception got lost."""
+    if _received:
+        raise Interrupted(_received[0])
+
+
+@contextlib.contextmanager
+def obeying(message: str) -> Iterator[None]:
+    """Turn signals into `Interrupted` inside of the block; print a message if the process has to be ended at once.
+
+    Signals that the process ignores, as under `nohup`, stay ignored. In another thread than the main one this does
+    nothing, since Python handles no signals there.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _received.clear()
+    numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers if signal.getsignal(number) != signal.SIG_IGN}
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    finished = threading.Event()
+    threading.Thread(target=_end_at_last, args=(reader, finished, [*before], message), daemon=True).start()
+    woken = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    try:
+        for number in before:
+            signal.signal(number, _interrupt)
+        yield
+        check()
+    finally:
+        finished.set()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(woken)
+        writer.close()  # which ends the thread
+
+
+def _interrupt(number: int, _: object) -> None:
+    _received.append(number)
+    raise Interrupted(number)
+
+
+def _end_at_last(reader: socket.socket, finished: threading.Event, numbers: list[int], message: str) -> None:
+    """Wait for one of some signals, then for the end of the block; end the process if that does not come."""
+    with reader:
+        while received := reader.recv(1):
+            if received[0] in numbers:
+                if not finished.wait(GRACE):
+                    os.write(2, f"\n{message}\n".encode(errors="backslashreplace"))
+                    os._exit(128 + received[0])
+                return

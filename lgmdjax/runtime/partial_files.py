@@ -1,0 +1,144 @@
+"""Files and folders that appear whole or not at all, whatever ends the process that writes them.
+
+A file is written under a temporary name, and gets its own when its content is on the disk, so that not even a power cut
+leaves half a file under a final name. What processes leave behind that are killed is removed by the next one.
+"""
+
+import contextlib
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from filelock import FileLock
+
+from lgmdjax.errors import InputError
+from lgmdjax.runtime import checksums
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path in the folder of `path`; at the end of the block the file there replaces `path`.
+
+    A block that raises leaves `path` as it was, and no temporary file. A process that is killed leaves a temporary
+    file, `<name>.<process>.partial` (`remove_partial_files`).
+    """
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        sync(partial)
+        os.replace(partial, path)
+        sync(path.parent)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def replacing_all(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder; at the end of the block its files move into `folder`, which is made if need be.
+
+    A block that raises leaves `folder` as it was. What processes left there that were killed inside of the block is
+    removed; what belongs to a living one is not.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned_folders(folder)
+        work = folder / f".partial-{secrets.token_hex(8)}"
+        lock = FileLock(_lock_of(work)).acquire()  # before there is a folder, so that one without a lock is abandoned
+    except OSError as error:
+        raise not_writable(folder, error) from error
+    try:
+        with lock:
+            work.mkdir()
+            yield work
+            for file in work.iterdir():
+                sync(file)
+                os.replace(file, folder / file.name)
+            sync(folder)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            _lock_of(work).unlink(missing_ok=True)
+            folder.rmdir()  # fails if the folder has other files
+
+
+def require_empty(folder: Path) -> None:
+    """Raise `InputError` unless a folder is empty or missing, so that nothing of the user's is replaced."""
+    if folder.is_dir() and not any(folder.iterdir()):
+        return
+    if folder.exists() or folder.is_symlink():
+        content = "has files" if folder.is_dir() else "is no folder"
+        raise InputError(f"expected an empty or a new folder, got {folder}, which {content}; choose another")
+
+
+@contextlib.contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `folder`; at the end of the block it becomes `folder`, with all of its files.
+
+    A block that raises leaves nothing. Raises `InputError` for a folder that has files or cannot be made.
+    """
+    require_empty(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        work = tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent)
+    except OSError as error:
+        raise not_writable(folder, error) from error
+    with work:
+        whole = Path(work.name, folder.name)
+        whole.mkdir()
+        yield whole
+        require_empty(folder)
+        if folder.exists():
+            folder.rmdir()
+        for file in whole.iterdir():
+            sync(file)
+        os.replace(whole, folder)
+        sync(folder.parent)
+
+
+def remove_partial_files(folder: Path) -> None:
+    """Remove what killed processes left of unfinished files in a folder and in those below it.
+
+    Only the process that holds the lock of the folder may call this.
+    """
+    for suffix in checksums.PARTIAL:
+        for abandoned in folder.rglob(f"*{suffix}"):
+            if abandoned.is_file():
+                abandoned.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until the content of a file, or the names in a folder, are on the disk."""
+    if path.is_dir():
+        with contextlib.suppress(OSError):  # Windows opens no folders; some network disks sync none
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+    else:
+        with path.open("rb+") as file:  # for writing, as Windows wants it
+            os.fsync(file.fileno())
+
+
+def _lock_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.lock")
+
+
+def _remove_abandoned_folders(folder: Path) -> None:
+    """Remove the temporary folders of killed processes, whose locks the operating system released."""
+    for work in [*folder.glob(".partial-*")]:
+        lock = work if work.suffix == ".lock" else _lock_of(work)
+        with contextlib.suppress(OSError), FileLock(lock).acquire(blocking=False):
+            shutil.rmtree(lock.with_suffix(""), ignore_errors=True)
+            lock.unlink(missing_ok=True)
+
+
+def not_writable(folder: Path, error: OSError) -> InputError:
+    """Return the error to raise when results cannot be written to a folder."""
+    reason = error.strerror or error
+    return InputError(f"expected a folder that can be written, got {folder} ({reason}); choose another --out")

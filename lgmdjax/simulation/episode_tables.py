@@ -1,0 +1,151 @@
+"""Tables of recorded walks: their columns, and what may be in them (`lgmdjax.simulation.episodes`)."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from lgmdjax.errors import InputError
+from lgmdjax.runtime import checksums, schema
+from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.simulation import finite
+from lgmdjax.simulation.closed_loop import Record
+
+SIDES = ("left", "right")
+MAX_ROWS = 10_000_000  # of a chunk: four hours of 23 robots
+MAX_NUMBER = 1e6  # in any unit: far beyond what a robot measures
+
+
+@dataclass(frozen=True)
+class Field:
+    """Names of the columns that hold one field of `Record`, their unit, and the kind of their numbers."""
+
+    columns: tuple[str, ...]
+    unit: str = ""
+    kind: str = "f"  # of NumPy's dtype: float, integer, boolean
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the field in one frame."""
+        return (6, 3) if len(self.columns) == 18 else (len(self.columns),) if len(self.columns) > 1 else ()
+
+
+FIELDS: Mapping[str, Field] = {
+    "time": Field(("time",), "s"),
+    "position": Field(("x", "y", "z"), "m"),
+    "quaternion": Field(("qw", "qx", "qy", "qz"), "1"),
+    "joints": Field(tuple(f"joint_{j}" for j in range(18)), "rad"),
+    "u": Field(tuple(f"u_{side}" for side in SIDES), "1"),
+    "feed_forward": Field(tuple(f"feed_forward_{side}" for side in SIDES), "grey"),
+    "excitation": Field(tuple(f"excitation_{side}" for side in SIDES), "grey"),
+    "distances": Field(tuple(f"distance_{side}" for side in SIDES), "m"),
+    "corridor": Field(tuple(f"corridor_{side}" for side in SIDES), "m"),
+    "label": Field(tuple(f"label_{side}" for side in SIDES), "0.05 m/s"),
+    "velocity": Field(tuple(f"velocity_{side}" for side in SIDES), "0.05 m/s"),
+    "clearance": Field(("clearance",), "m"),
+    "contact": Field(("contact",), kind="b"),
+    "is_first": Field(("is_first",), kind="b"),
+    "resets": Field(("resets",), kind="i"),
+    "ok": Field(("ok",), kind="b"),
+}
+"""The columns of each field of `Record`, in its order."""
+
+ORIGIN = {"episode": np.int32, "robot": np.int32, "room": np.int32, "seed": np.int64}
+"""The columns that tell which walk a row belongs to."""
+COLUMNS = (*ORIGIN, *(column for field in FIELDS.values() for column in field.columns))
+KINDS = dict.fromkeys(ORIGIN, "i") | {column: field.kind for field in FIELDS.values() for column in field.columns}
+IS_KIND = {
+    "f": lambda dtype: pa.types.is_float32(dtype) or pa.types.is_float64(dtype),
+    "i": pa.types.is_integer,
+    "b": pa.types.is_boolean,
+}
+KIND_NAMES = {"f": "floats", "i": "integers", "b": "booleans"}
+INDEX, SEED = schema.Integer(0, 2**31 - 1), schema.Integer(0, 2**63 - 1)
+
+
+def from_record(record: Record, episode: int, rooms: Sequence[int], seed: int) -> pa.Table:
+    """Return the columns of a record; raise `InputError` if its shapes, types or numbers do not fit."""
+    arrays = _checked_arrays(record)
+    robots, frames = arrays["time"].shape
+    schema.check(INDEX, episode, "episodes: episode", "number them from 0")
+    schema.check(SEED, seed, "episodes: seed", "choose another")
+    if len(rooms) != robots:
+        raise InputError(f"episodes: expected a room for each of {robots} robots, got {len(rooms)}")
+    for room in rooms:
+        schema.check(INDEX, room, "episodes: room", "number them from 0")
+    robot, room = np.arange(robots), np.asarray(rooms)
+    origin = {"episode": episode, "robot": np.repeat(robot, frames), "room": np.repeat(room, frames), "seed": seed}
+    columns = {name: np.broadcast_to(origin[name], robots * frames).astype(ORIGIN[name]) for name in ORIGIN}
+    arrays = finite.require_finite(Record(**arrays), "episodes")
+    for name, field in FIELDS.items():
+        values = np.reshape(getattr(arrays, name), (robots * frames, len(field.columns)))
+        columns |= {column: values[:, k] for k, column in enumerate(field.columns)}
+    return pa.table(columns)
+
+
+def check(table: pa.Table, path: Path) -> pa.Table:
+    """Return the columns of a walk's table; raise `InputError` for missing columns, other types, and wrong numbers."""
+    names = table.column_names
+    if missing := set(COLUMNS) - set(names):
+        raise InputError(f"{path}: expected all columns, got none called {min(missing)}; collect it again")
+    if len(set(names)) < len(names) or not 0 < table.num_rows <= MAX_ROWS:
+        raise InputError(
+            f"{path}: expected 1 to {MAX_ROWS} rows and every column once, got {table.num_rows} rows of {names}"[:300]
+            + "; collect it again"
+        )
+    for name in COLUMNS:
+        column, kind = table[name], KINDS[name]
+        if not IS_KIND[kind](column.type) or column.null_count:
+            found = f"{column.type}{f' with {column.null_count} nulls' if column.null_count else ''}"
+            raise InputError(f"{path}: expected {KIND_NAMES[kind]} in column {name}, got {found}; collect it again")
+    return _with_finite_numbers(table.select(COLUMNS), path)
+
+
+def digest(table: pa.Table, header: JsonObject) -> str:
+    """Return the checksum of a table and of its header, but for the header's own checksum."""
+    rest = {name: value for name, value in header.items() if name != checksums.SEAL}
+    columns = [(name, str(table[name].type), table[name].to_numpy().tobytes()) for name in table.column_names]
+    return checksums.digest(repr((json.dumps(rest, sort_keys=True), columns)).encode())
+
+
+def _checked_arrays(record: Record) -> dict[str, np.ndarray]:
+    """Return the fields of a record as arrays of axes (robot, frame, ...)."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, field in FIELDS.items():
+        try:
+            values = np.asarray(getattr(record, name))
+        except (AttributeError, ValueError) as error:
+            raise InputError(f"episodes {name}: expected an array, got {error}; see Record") from error
+        axes = arrays["time"].shape if arrays else values.shape
+        if len(axes) != 2 or not all(axes) or values.shape != (*axes, *field.shape):
+            numbers = len(field.columns)
+            raise InputError(
+                f"episodes {name}: expected {numbers} numbers a frame for {' robots and '.join(map(str, axes[:2]))} "
+                f"frames, got shape {values.shape}; see Record"
+            )
+        kinds = "iu" if field.kind == "i" else field.kind
+        if values.dtype.kind not in kinds or (field.kind == "f" and values.dtype.itemsize not in (4, 8)):
+            raise InputError(f"episodes {name}: expected {KIND_NAMES[field.kind]}, got {values.dtype}; see Record")
+        arrays[name] = values
+    return arrays
+
+
+def _with_finite_numbers(table: pa.Table, path: Path) -> pa.Table:
+    """Return a table without nan; raise `InputError` for one in a frame that is ok. Older files have some in others."""
+    ok = table["ok"].to_numpy()
+    for name, kind in KINDS.items():
+        values = table[name].to_numpy()
+        sane = np.abs(values) <= MAX_NUMBER if kind == "f" else values >= 0
+        if kind == "b" or sane.all():
+            continue
+        if np.any(~sane & (ok | (kind == "i"))):
+            row = int(np.argmax(~sane & (ok | (kind == "i"))))
+            raise InputError(
+                f"{path}: expected numbers up to {MAX_NUMBER:g} in frames that are ok, got {name} {values[row]} "
+                f"of robot {table['robot'][row]} in row {row}; collect it again"
+            )
+        table = table.set_column(table.column_names.index(name), name, pa.array(np.where(sane, values, 0)))
+    return table
