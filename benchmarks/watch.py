@@ -42,7 +42,7 @@ def write_video(path: Path) -> Path:
     """Write a texture that drifts two pixels a frame."""
     rng = np.random.default_rng(0)
     texture = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, WIDTH + 2 * FRAMES, 3), np.uint8), (0, 0), 4)
-    texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
+    texture = cv2.normalize(texture, np.empty_like(texture), 0, 255, cv2.NORM_MINMAX)
     with video_io.open_writer(path, WIDTH, HEIGHT, 30) as write:
         for frame in range(FRAMES):
             write(np.ascontiguousarray(texture[:, 2 * frame : 2 * frame + WIDTH]))
