@@ -1,5 +1,6 @@
 """The command line: a user's mistake is one line on stderr and exit code 2, and help loads no JAX."""
 
+import json
 import os
 import subprocess
 import sys
@@ -206,7 +207,9 @@ def test_export_lists_its_files_and_replaces_none(tmp_path: Path, capsys: pytest
     assert [line.partition(":")[0] for line in lines[:3]] == [
         str(tmp_path / "robot" / name) for name in ("nervous_system.c", "nervous_system.h", "card.json")
     ]
-    assert lines[3] == "static memory of the C program: 7.0 kB of state, 19.8 kB of constants"
+    memory = json.loads((tmp_path / "robot" / "card.json").read_text())["memory"]
+    sizes = f"{memory['state'] / 1000:.1f} kB of state, {memory['constants'] / 1000:.1f} kB of constants"
+    assert lines[3] == f"static memory of the C program: {sizes}"
     assert "empty or a new folder" in refused(command, capsys)
     assert "lgmdjax train" in refused(["export", str(tmp_path), str(tmp_path / "new"), "--formats", "c"], capsys)
     assert "choose from onnx, stablehlo, c" in refused([*command[:2], str(tmp_path / "new"), "--formats"], capsys)
