@@ -1,7 +1,7 @@
 """Make the animation at the top of the README: `python experiments/animate_walk.py` (three minutes on two cores).
 
-The pretrained robot meets a tube, fig. 14 of the paper. The first walk that passes it is shown: from outside,
-through both eyes, and with the detectors' u and the commands v below.
+The pretrained robot meets trees and bushes, fig. 15b of the paper. The first walk that passes them is shown: from
+outside, through both eyes, and with the detectors' u and the commands v below.
 """
 
 import io
@@ -15,8 +15,8 @@ from PIL import Image
 import lgmdjax as lj
 from lgmdjax.runtime.jax_setup import prepare_jax
 
-TRIAL, SEEDS, SEED = "tube", 1, 1
-SECONDS = 30.0  # of walking
+TRIAL, SEEDS, SEED = "outdoor", 4, 1
+SECONDS = 60.0  # of walking
 SHOWN = 9.0  # s of video, at twice real speed
 WIDTH, QUALITY = 640, 60  # px and WebP quality of the animation
 TARGET = Path(__file__).parents[1] / "docs" / "_static" / "walk.webp"

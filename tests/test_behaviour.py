@@ -13,7 +13,6 @@ import small_rooms
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import policies
-from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, recording, rollout
 from lgmdjax.studies import velocity
 from lgmdjax.world import scenes
@@ -64,7 +63,7 @@ def rooms():
 def records(rooms):
     """Rendered rollouts by policy; axes (scene, original or mirrored, frame)."""
     with jax.enable_x64(False):
-        robot = assembly.with_camera(assembly.load_robot(), CameraSettings(width=80, height=60, pooling=3))
+        robot = assembly.load_robot()
         model = hexapod.build()
         records = {}
         for policy in (policies.LEARNED, policies.BLIND):
