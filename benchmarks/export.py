@@ -90,14 +90,16 @@ class ByHand:
         card = json.loads((folder / "card.json").read_text())
         state = first_state(card)
         self.cells = card["lgmd"]["columns"], card["lgmd"]["rows"]
-        self.seen = card["eyes"]["columns_seen"]
+        self.seen = card["eyes"]["rows_seen"], card["eyes"]["columns_seen"]
+        self.column_weights = np.asarray(card["lgmd"]["weights"], np.float32)
         self.last: list[np.ndarray] = []
         self.P = [np.zeros(self.cells[::-1], np.float32) for _ in range(2)]
         self.h, self.c = state["navigator_hidden"], state["navigator_cell"]
         self.u, self.v = state["cpg_activation"], state["cpg_adaptation"]
 
     def __call__(self, pictures: np.ndarray) -> np.ndarray:
-        halves = pictures[0, :, : self.seen], pictures[1, :, -self.seen :]
+        rows, columns = self.seen
+        halves = pictures[0, :rows, :columns], pictures[1, :rows, : -columns - 1 : -1]
         u = np.array([self.see(eye, half) for eye, half in enumerate(halves)], np.float32)
         velocity = self.decide(u)
         for _ in range(6):
@@ -112,7 +114,8 @@ class ByHand:
             self.last.append(L)
         I = cv2.filter2D(self.P[eye], cv2.CV_32F, w["kernel"], borderType=cv2.BORDER_CONSTANT)  # noqa: E741
         S = cv2.absdiff(L, self.last[eye]) - w["inhibition"] * np.abs(I)
-        mean, FF = S[w["threshold"] <= S].sum() / S.size, np.abs(self.P[eye]).mean()
+        mean = (self.column_weights * np.where(w["threshold"] <= S, S, 0)).mean()
+        FF = (self.column_weights * np.abs(self.P[eye])).mean()
         self.last[eye], self.P[eye] = L, L - self.last[eye]
         return 0.5 if w["suppression"] < FF else float(sigmoid(mean))
 

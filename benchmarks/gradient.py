@@ -46,7 +46,7 @@ from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches, sharding
 
 Kind = Literal["rollout", "remat", "stored", "forward mode"]
-CAMERA = CameraSettings(width=80, height=60, pooling=3)
+CAMERA = CameraSettings(width=80, height=60, pooling=3, ground=0.5, falloff=2.0)
 TARGET = 5.0  # rollouts that take as long as a gradient with remat
 TARGET_COLD, TARGET_WARM = 180.0, 15.0  # s, compilation of the gradient
 REPEATS = 3

@@ -1,8 +1,7 @@
 """Train the robot that is part of the package: `python experiments/train_pretrained.py`, 24 minutes on 2 cores.
 
-The pretrained robot is that of one run: its controller with the gait that it was trained on. With another gait, fitted
-in the same way, the same controller turned away from a tube in 2 of 6 walks, with its own in 12 of 12. After an
-interruption the same command resumes.
+The pretrained robot is that of one run: its controller with the gait that it was trained on. After an interruption the
+same command resumes.
 """
 
 import shutil

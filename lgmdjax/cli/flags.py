@@ -316,14 +316,11 @@ _REGISTRY = ConstructorRegistry()
 
 @_REGISTRY.primitive_rule
 def _read_paths(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
-    """Expand ~, and refuse an empty path, which would be the current folder."""
+    """Expand ~."""
     if info.type is not Path:
         return None
 
     def read(words: list[str]) -> Path:
-        if not words[0]:
-            # No ValueError, which tyro would print in a box.
-            raise FileNotFoundError("expected a path, got an empty one; give . for the current folder")
         return Path(words[0]).expanduser()
 
     return PrimitiveConstructorSpec(

@@ -30,7 +30,7 @@ from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.sensors import hemifield
 
 Frames = Float[Array, "2 height width"] | UInt8[Array, "2 height width"]
-"""Images of the left and the right eye (`lgmd.Frame`)."""
+"""Images of the left and the right eye (`cells.Frame`)."""
 
 
 @struct.dataclass(kw_only=True)

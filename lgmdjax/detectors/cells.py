@@ -29,6 +29,7 @@ U_AT_REST = 0.5  # response without motion
 Scalar = Float[Array, ""] | float
 Cells = Float[Array, "rows columns"]
 Frame = Float[Array, "height width"] | UInt8[Array, "height width"]
+"""An image of one eye, grey levels 0..255, in floating point or as a camera delivers it."""
 
 
 class Neighbours(NamedTuple):

@@ -67,8 +67,6 @@ KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
 U_AT_REST = cells.U_AT_REST
 FULL_WEIGHT_BEARING = math.radians(20.0)  # theta_0, up to which all cells have the same weight
 
-"""An image of one eye, grey levels 0..255, in floating point or as a camera delivers it."""
-
 # w_I (eq. 9)
 KERNEL = (
     (0.06, 0.12, 0.25, 0.12, 0.06),

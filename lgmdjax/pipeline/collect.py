@@ -60,7 +60,8 @@ def _calibrate(gait: Path, settings: CollectSettings, seed: int) -> JsonObject:
     print("calibrate: rendering the walks for all candidates of T_s and W_I", flush=True)
     u, feed_forward = lgmd_grid_search.evaluate(detector, camera_params, rooms.arena, record, candidates)
     selection = lgmd_grid_search.select(record, np.asarray(u), np.asarray(feed_forward), candidates)
-    return dataclasses.asdict(selection) | {"overlap": settings.eyes.overlap, "pooling": settings.eyes.pooling}
+    field = {name: getattr(settings.eyes, name) for name in ("overlap", "ground", "falloff", "pooling")}
+    return dataclasses.asdict(selection) | field
 
 
 def _teacher_robot(gait: Path, settings: CollectSettings, detector: lgmd.Params) -> closed_loop.Params:

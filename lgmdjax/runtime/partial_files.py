@@ -8,7 +8,6 @@ import contextlib
 import os
 import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -84,20 +83,26 @@ def new_folder(folder: Path) -> Iterator[Path]:
     require_empty(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        work = tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent)
+        _remove_abandoned_folders(folder.parent)
+        work = folder.parent / f".partial-{secrets.token_hex(8)}"
+        lock = FileLock(_lock_of(work)).acquire()  # before there is a folder, so that one without a lock is abandoned
     except OSError as error:
         raise not_writable(folder, error) from error
-    with work:
-        whole = Path(work.name, folder.name)
-        whole.mkdir()
-        yield whole
-        require_empty(folder)
-        if folder.exists():
-            folder.rmdir()
-        for file in whole.iterdir():
-            sync(file)
-        os.replace(whole, folder)
-        sync(folder.parent)
+    try:
+        with lock:
+            work.mkdir()
+            yield work
+            require_empty(folder)
+            if folder.exists():
+                folder.rmdir()
+            for file in work.iterdir():
+                sync(file)
+            os.replace(work, folder)
+            sync(folder.parent)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            _lock_of(work).unlink(missing_ok=True)
 
 
 def remove_partial_files(folder: Path) -> None:
@@ -141,4 +146,4 @@ def _remove_abandoned_folders(folder: Path) -> None:
 def not_writable(folder: Path, error: OSError) -> InputError:
     """Return the error to raise when results cannot be written to a folder."""
     reason = error.strerror or error
-    return InputError(f"expected a folder that can be written, got {folder} ({reason}); choose another --out")
+    return InputError(f"expected a folder that can be written, got {folder} ({reason}); choose another")

@@ -34,7 +34,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(
 ) -> None:
     (tmp_path / "file").touch()
     line = refused([command, "--scale", "smoke", "--out", str(tmp_path / "file")], capsys)
-    assert "can be written" in line and str(tmp_path / "file") in line and "choose another --out" in line
+    assert "can be written" in line and str(tmp_path / "file") in line and "choose another" in line
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

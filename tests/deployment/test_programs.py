@@ -111,7 +111,8 @@ def test_the_pictures_exercise_both_detectors_and_no_cell_is_so_near_its_thresho
     assert np.all(np.ptp(u[1:], axis=0) > 0.1) and np.any(u[2:] == lgmd.U_AT_REST) and np.mean(u > 0.51) > 0.5
     assert np.all(np.ptp(expected[0]["velocity"], axis=0) > 0.5)
     detector = params.controller.lgmd
-    cells = np.stack([[lgmd_cells(detector, pictures[:, 0, :, :40])], [lgmd_cells(detector, pictures[:, 1, :, 40:])]])
+    eyes = pictures[:, 0, :30, :40], pictures[:, 1, :30, :39:-1]
+    cells = np.stack([[lgmd_cells(detector, eye)] for eye in eyes])
     P = np.diff(cells.reshape(2, FRAMES, *cells.shape[-2:]).astype(float), axis=1)
     I = np.stack([[np.abs(correlate(difference)) for difference in eye] for eye in P[:, :-1]])  # noqa: E741
     S = np.abs(P[:, 1:]) - I * float(detector.inhibition)

@@ -26,7 +26,7 @@ from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.studies import closed_loop_finetune
 from lgmdjax.studies.settings import FinetuneSettings
 
-EYES = CameraSettings(width=80, height=60, pooling=3)
+EYES = CameraSettings(width=80, height=60, pooling=3, ground=0.5, falloff=2.0)  # of the pretrained robot
 DAGGER = TrainSettings(eyes=EYES, epochs=1, dagger_rounds=2, round_epochs=1, robots=4, round_seconds=3.0)
 SETTINGS = FinetuneSettings(
     benchmark=BenchmarkRooms(eyes=EYES, robots=2, seconds=2.0), dagger=DAGGER, demonstration_seconds=3.0, window=15,

@@ -42,7 +42,7 @@ from lgmdjax.studies import (
 from lgmdjax.studies.settings import FailureModesSettings, GaitGradientSettings, OverlapSettings
 from lgmdjax.world import arena
 
-EYES = CameraSettings(width=80, height=60, pooling=3)
+EYES = CameraSettings(width=80, height=60, pooling=3, ground=0.5, falloff=2.0)  # of the pretrained robot
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from lgmdjax.studies.settings import SupervisionSettings
 from lgmdjax.world import scenes
 
 pytestmark = pytest.mark.usefixtures("float32")
-EYES = CameraSettings(width=80, height=60, pooling=3)
+EYES = CameraSettings(width=80, height=60, pooling=3, ground=0.5, falloff=2.0)  # of the pretrained robot
 SECONDS = 4.0
 
 
@@ -129,7 +129,7 @@ def test_printed_coupling_changes_the_steps_but_not_the_direction(robot, rooms, 
 def test_supervision_study_trains_and_scores_every_case(tmp_path, monkeypatch):
     """From end to end with two cases; a second run reads all walks and fits, and gives the same rows."""
     monkeypatch.setattr(supervision, "CASES", (supervision.CASES[0], supervision.CASES[1]))
-    eyes = CameraSettings(width=80, height=60, pooling=3, ground=0.5, falloff=2.0)  # programs of the smoke run
+    eyes = EYES  # whose programs the smoke run has compiled
     settings = SupervisionSettings(
         benchmark=BenchmarkRooms(eyes=eyes, robots=4, seconds=5.0),
         dagger=TrainSettings(eyes=eyes, epochs=1, dagger_rounds=1, round_epochs=1, robots=4, round_seconds=5.0),
