@@ -27,7 +27,8 @@ def test_pictures_are_rendered_again_from_the_poses(tmp_path):
     writer = episodes.Writer(tmp_path, {})
     for _ in range(FRAMES):
         states, chunk = rollout.rollout_batch(params, model, rooms, states, policy=blind, frames=1, render=True)
-        frames.append(np.array(states.controller.lgmd.frame))
+        left, right = np.moveaxis(np.asarray(states.controller.lgmd.frame), 1, 0)
+        frames.append(np.stack([left, right[..., ::-1]], axis=1))  # the detectors see the outermost column first
         writer.write(chunk, episode=0, rooms=range(ROBOTS), seed=1)
     record = episodes.stack_walks(episodes.read(tmp_path))
     pictures = rerender.render_walks(CAMERA, rooms.arena, record)
