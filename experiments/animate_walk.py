@@ -18,7 +18,7 @@ from lgmdjax.runtime.jax_setup import prepare_jax
 TRIAL, SEEDS, SEED = "outdoor", 4, 1
 SECONDS = 60.0  # of walking
 SHOWN = 9.0  # s of video, at twice real speed
-WIDTH, QUALITY = 640, 60  # px and WebP quality of the animation
+WIDTH, QUALITY = 640, 55  # px and WebP quality of the animation
 TARGET = Path(__file__).parents[1] / "docs" / "_static" / "walk.webp"
 
 

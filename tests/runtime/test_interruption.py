@@ -38,7 +38,11 @@ DOING = {
     [*((doing, signal.SIGINT) for doing in DOING), ("waiting", signal.SIGTERM), ("waiting", signal.SIGHUP)],
 )
 def test_a_command_ends_within_two_seconds(doing: str, number: signal.Signals) -> None:
-    script = "import sys, time\nfrom lgmdjax.cli.main import exit_code\nfrom lgmdjax.runtime import interruption\n"
+    script = (
+        "import signal, sys, time\nfrom lgmdjax.cli.main import exit_code\nfrom lgmdjax.runtime import interruption\n"
+    )
+    script += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which a shell's background jobs ignore
+    script += "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"  # and those of nohup
     script += (
         f"def command():\n    print(flush=True)\n{textwrap.indent(textwrap.dedent(DOING[doing]).strip(), '    ')}\n"
     )
@@ -47,7 +51,10 @@ def test_a_command_ends_within_two_seconds(doing: str, number: signal.Signals) -
         assert process.stdout is not None and process.stdout.readline()
         time.sleep(0.2)  # into the command
         process.send_signal(number)
-        _, errors = process.communicate(timeout=30)
+        try:
+            _, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()  # else the block would wait for it
     assert process.returncode == 128 + number
     assert errors.decode().split("\n")[-2] == "lgmdjax: interrupted; the same command resumes"
     assert b"Traceback" not in errors
@@ -63,10 +70,12 @@ def test_handlers_are_those_of_before_afterwards() -> None:
 
 
 def test_an_exception_that_got_lost_is_raised_by_the_next_look() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job ignores
     with pytest.raises(interruption.Interrupted, match="SIGINT"), interruption.obeying(""):
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         interruption.check()
+    signal.signal(signal.SIGINT, before)
 
 
 def test_ignored_signals_stay_ignored() -> None:

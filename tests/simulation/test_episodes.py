@@ -52,7 +52,8 @@ def record(robots=2, frames=20, start=0, dtype: type = np.float32) -> Record:
 def write(folder, *records, settings=SETTINGS, **walk):
     writer = episodes.Writer(folder, settings)
     for chunk in records:
-        writer.write(chunk, **{"episode": 0, "rooms": range(len(chunk.time)), "seed": 7} | walk)
+        rooms = walk.pop("rooms") if "rooms" in walk else range(len(chunk.time))
+        writer.write(chunk, **{"episode": 0, "rooms": rooms, "seed": 7} | walk)
     return writer
 
 
