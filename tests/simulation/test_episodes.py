@@ -52,8 +52,8 @@ def record(robots=2, frames=20, start=0, dtype: type = np.float32) -> Record:
 def write(folder, *records, settings=SETTINGS, **walk):
     writer = episodes.Writer(folder, settings)
     for chunk in records:
-        rooms = walk.pop("rooms") if "rooms" in walk else range(len(chunk.time))
-        writer.write(chunk, **{"episode": 0, "rooms": rooms, "seed": 7} | walk)
+        rooms = walk["rooms"] if "rooms" in walk else range(len(chunk.time))
+        writer.write(chunk, **{"episode": 0, "seed": 7} | walk | {"rooms": rooms})
     return writer
 
 
