@@ -49,11 +49,11 @@ def record(robots=2, frames=20, start=0, dtype: type = np.float32) -> Record:
     )
 
 
-def write(folder, *records, settings=SETTINGS, **walk):
+def write(folder, *records, settings=SETTINGS, episode=0, rooms=None, seed=7):
     writer = episodes.Writer(folder, settings)
     for chunk in records:
-        rooms = walk["rooms"] if "rooms" in walk else range(len(chunk.time))
-        writer.write(chunk, **{"episode": 0, "seed": 7} | walk | {"rooms": rooms})
+        of_chunk = range(len(chunk.time)) if rooms is None else rooms
+        writer.write(chunk, episode=episode, rooms=of_chunk, seed=seed)
     return writer
 
 
