@@ -43,26 +43,12 @@ def replacing_all(folder: Path) -> Iterator[Path]:
     A block that raises leaves `folder` as it was. What processes left there that were killed inside of the block is
     removed; what belongs to a living one is not.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned_folders(folder)
-        work = folder / f".partial-{secrets.token_hex(8)}"
-        lock = FileLock(_lock_of(work)).acquire()  # before there is a folder, so that one without a lock is abandoned
-    except OSError as error:
-        raise not_writable(folder, error) from error
-    try:
-        with lock:
-            work.mkdir()
-            yield work
-            for file in work.iterdir():
-                sync(file)
-                os.replace(file, folder / file.name)
-            sync(folder)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            _lock_of(work).unlink(missing_ok=True)
-            folder.rmdir()  # fails if the folder has other files
+    with _working_folder(folder, remove_empty=True) as work:
+        yield work
+        for file in work.iterdir():
+            sync(file)
+            os.replace(file, folder / file.name)
+        sync(folder)
 
 
 def require_empty(folder: Path) -> None:
@@ -81,28 +67,44 @@ def new_folder(folder: Path) -> Iterator[Path]:
     A block that raises leaves nothing. Raises `InputError` for a folder that has files or cannot be made.
     """
     require_empty(folder)
+    with _working_folder(folder.parent) as work:
+        yield work
+        require_empty(folder)
+        if folder.exists():
+            folder.rmdir()
+        for file in work.iterdir():
+            sync(file)
+        os.replace(work, folder)
+        sync(folder.parent)
+
+
+@contextlib.contextmanager
+def _working_folder(parent: Path, *, remove_empty: bool = False) -> Iterator[Path]:
+    """Yield a locked temporary folder in `parent`, which is made if need be; remove it, and those of killed processes.
+
+    Raises `InputError` if none can be made.
+
+    Args:
+        parent: where the folder is made.
+        remove_empty: remove `parent` too, if it is empty at the end.
+    """
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned_folders(folder.parent)
-        work = folder.parent / f".partial-{secrets.token_hex(8)}"
+        parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned_folders(parent)
+        work = parent / f".partial-{secrets.token_hex(8)}"
         lock = FileLock(_lock_of(work)).acquire()  # before there is a folder, so that one without a lock is abandoned
     except OSError as error:
-        raise not_writable(folder, error) from error
+        raise not_writable(parent, error) from error
     try:
         with lock:
             work.mkdir()
             yield work
-            require_empty(folder)
-            if folder.exists():
-                folder.rmdir()
-            for file in work.iterdir():
-                sync(file)
-            os.replace(work, folder)
-            sync(folder.parent)
     finally:
         shutil.rmtree(work, ignore_errors=True)
         with contextlib.suppress(OSError):
             _lock_of(work).unlink(missing_ok=True)
+            if remove_empty:
+                parent.rmdir()  # fails if it has other files
 
 
 def remove_partial_files(folder: Path) -> None:
