@@ -37,14 +37,12 @@ from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import partial_files
 from lgmdjax.sensors import hemifield
 
 MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third is the first with all of it
 MIN_SIZE = 16  # px, smallest width and height of the picture of an eye
 NOMINAL_RATE = 30  # Hz, of the robot's cameras
-SIDES = ("left", "right")
-CONSTANTS = ("threshold", "suppression", "inhibition")  # of the detector, which the command line can change
 TableFormat = Literal["csv", "parquet"]
 UNITS = {
     "time": "s",
@@ -67,7 +65,7 @@ def watch_video(flags: WatchFlags) -> list[Path]:
     """Run both detectors on the video of the flags, and return the written files."""
     if flags.mono and flags.stereo is not None:
         raise InputError("expected --mono or --stereo, got both; leave one out")
-    given = {name: getattr(flags, name) for name in CONSTANTS}
+    given = {name: getattr(flags, name) for name in lgmd.SCALARS}
     params = replace(lgmd.Params(), **{name: value for name, value in given.items() if value is not None})
     layout = StereoLayout(stereo=flags.stereo is not None, overlap=flags.overlap, width=flags.width)
     return detect_looming(
@@ -95,7 +93,7 @@ def detect_looming(
         eyes = _split(np.zeros((height, width), np.uint8), layout)
         overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
         _print_notes(path, video)
-        with storage.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
+        with partial_files.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
             samples, excitations = _process(
                 frames, layout, params, overlay=overlay_layout, target=partial_folder / "overlay.mp4", rate=video.rate
             )
@@ -127,7 +125,7 @@ def plot(responses: pa.Table, params: lgmd.Params) -> Figure:
     figure = Figure(figsize=(style.WIDTH, 3.4))
     upper, lower = figure.subplots(2, 1, sharex=True)
     time = responses["time"].to_numpy()
-    for side, colour in zip(SIDES, (style.LEFT_COLOUR, style.RIGHT_COLOUR), strict=True):
+    for side, colour in zip(hemifield.SIDES, (style.LEFT_COLOUR, style.RIGHT_COLOUR), strict=True):
         upper.plot(time, responses[f"u_{side}"].to_numpy(), color=colour, label=f"{side} eye")
         lower.plot(time, responses[f"feed_forward_{side}"].to_numpy(), color=colour)
     lower.axhline(float(params.suppression), color=style.GREY, linestyle=":", label="T_f")
@@ -253,7 +251,7 @@ def _table(
 ) -> pa.Table:
     """Return the responses as a table with one row for each frame."""
     columns: dict[str, object] = {"frame": range(len(samples)), "time": [sample.time for sample in samples]}
-    for side, name in enumerate(SIDES):
+    for side, name in enumerate(hemifield.SIDES):
         columns[f"u_{name}"] = [sample.u[side] for sample in samples]
         columns[f"feed_forward_{name}"] = [sample.feed_forward[side] for sample in samples]
         columns[f"excitation_{name}"] = [pair[side] for pair in excitations]
@@ -261,7 +259,7 @@ def _table(
 
 
 def _metadata(path: Path, video: video_io.Video, layout: StereoLayout, params: lgmd.Params) -> dict[str, str]:
-    constants = {name: float(getattr(params, name)) for name in CONSTANTS}
+    constants = {name: float(getattr(params, name)) for name in lgmd.SCALARS}
     facts = {"units": UNITS, "eyes": asdict(layout), "lgmd": constants, "rate": float(video.rate)}
     name = os.fsencode(path.name).decode("utf-8", "replace")
     return {"video": name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}

@@ -90,7 +90,7 @@ def run_trial(
     """
     _check(trial, policy, seeds)
     robot = assembly.load_robot(run / "fit-gait", run / "train") if run else assembly.load_robot()
-    robot = robot if width is None else assembly.with_camera(robot, assembly.scale_camera(robot, width))
+    robot = robot if width is None else assembly.with_resolution(robot, assembly.scale_resolution(robot, width))
     definition = trials.TRIALS[trial]
     trial_run = describe_run(robot, trial, policy, seeds or definition.seeds, definition.seconds)
 

@@ -21,7 +21,7 @@ from lgmdjax.control import names, navigator, policies
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import metrics
 from lgmdjax.learning import behaviour_cloning, sequences
-from lgmdjax.learning.settings import TrainSettings
+from lgmdjax.learning.settings import DaggerSettings, TrainSettings
 from lgmdjax.locomotion import cpg
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, room_batches
@@ -79,7 +79,7 @@ def run(
     folder: Path,
     robot: closed_loop.Params,
     walks: list[Walk],
-    settings: TrainSettings,
+    settings: DaggerSettings,
     seed: int,
     *,
     variant: names.Variant = "lstm",
@@ -178,7 +178,7 @@ def _run_round(
     folder: Path,
     robot: closed_loop.Params,
     walks: list[Walk],
-    settings: TrainSettings,
+    settings: DaggerSettings,
     *,
     seed: int,
     number: int,
@@ -218,7 +218,7 @@ def _walk_with_gain(
     robot: closed_loop.Params,
     params: navigator.Params,
     rooms: closed_loop.Room,
-    settings: TrainSettings,
+    settings: DaggerSettings,
     *,
     turn_gain: float,
     seed: int,

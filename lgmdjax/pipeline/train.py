@@ -39,7 +39,9 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     schema.check(assembly.BASELINES, baselines, "baselines", "collect again")
     write_arrays(folder / "baselines.npz", baselines)
     detector = assembly.load_detector(inputs["collect"])
-    robot = assembly.assemble_robot(inputs["fit-gait"], settings.eyes, detector, assembly.make_policies())
+    recorded_with = assembly.read_camera_settings(header)
+    robot = assembly.assemble_robot(inputs["fit-gait"], recorded_with, detector, assembly.make_policies())
+    robot = assembly.with_resolution(robot, settings.eyes)
     walks = dagger.run(folder, robot, recorded, settings, seed)
     train, test, unseen = dagger.split_rooms(episodes.segments(walks), seed)
     fits = _fit_variants(folder, train, test, settings, seed)
@@ -67,7 +69,8 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     }
     write_json(folder / "training.json", result)
     # The camera is that of the navigator's own walks, which are most of its training data.
-    facts = {"eyes": dataclasses.asdict(settings.eyes), "seed": seed, "training": dataclasses.asdict(settings)}
+    eyes = dataclasses.asdict(assembly.camera_settings(robot))
+    facts = {"eyes": eyes, "seed": seed, "training": dataclasses.asdict(settings)}
     navigator.save(folder / "controller.safetensors", learned, header | facts)
     write_arrays(folder / "prediction.npz", _prediction(learned, unseen))
 

@@ -44,7 +44,7 @@ Change = Callable[[closed_loop.Params, Path], closed_loop.Params]  # (robot, fol
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: ErrataSettings, seed: int) -> None:
     """Measure the robot with every printed equation."""
-    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
+    robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     literal = folder / "literal.safetensors"
     if not literal.exists():  # a second fit might differ in the last bits, and the recorded walks would not match
         geometry = kinematics.read_geometry(hexapod.load())
