@@ -32,7 +32,7 @@ def run_bench(flags: BenchFlags) -> Iterator[str]:
 
 
 def _expand(name: str) -> Sequence[str]:
-    return tuple(stimulus_scores.CONTESTANTS) if name == "all" else (name,)
+    return tuple(stimulus_scores.DETECTORS) if name == "all" else (name,)
 
 
 def table(rows: Sequence[JsonObject]) -> str:

@@ -133,14 +133,18 @@ def select_turn_gain(
     for turn_gain in settings.turn_gains:
         candidates.append(behaviour_cloning.rescale_turns(fit.best, test, turn_gain))
         record = _walk_with_gain(folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed)
-        score = metrics.score(record, cpg.CYCLE_TIME)
-        row = {"caution": turn_gain, "tight": count_approaches(record)}
-        coverage = score.progress.coverage.value
-        rows.append(row | {"collisions": score.collisions, "distance": score.distance, "coverage": coverage})
+        rows.append({"caution": turn_gain} | _summarise(record))
     least = MIN_RELATIVE_COVERAGE * max(row["coverage"] for row in rows)
     going_on = [k for k, row in enumerate(rows) if row["coverage"] >= least]
     best = min(going_on, key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
     return candidates[best], [row | {"chosen": k == best} for k, row in enumerate(rows)]
+
+
+def _summarise(record: closed_loop.Record) -> JsonObject:
+    """Return what turn gains are compared by."""
+    score = metrics.score(record, cpg.CYCLE_TIME)
+    row = {"tight": count_approaches(record), "collisions": score.collisions, "distance": score.distance}
+    return row | {"coverage": score.progress.coverage.value}
 
 
 def count_approaches(record: closed_loop.Record) -> int:
