@@ -38,6 +38,7 @@ FIELDS = {
     "without the ground": {"ground": 0.5, "falloff": 0.0},
     "with falloff": {"ground": 0.0, "falloff": 2.0},
     "without the ground, with falloff": {"ground": 0.5, "falloff": 2.0},
+    "without the ground, with more falloff": {"ground": 0.5, "falloff": 3.0},
 }
 
 

@@ -12,10 +12,11 @@ Writes to a folder with the full name of the video:
 
 import contextlib
 import json
+import math
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -58,6 +59,7 @@ class StereoLayout:
 
     stereo: bool = False  # each frame holds two pictures, side by side
     overlap: float = 0.5  # fraction of the picture's width that an eye sees, from its own side
+    ground: float = 0.0  # fraction of its height, at the bottom, that no eye sees
     width: int = 320  # px of one picture; wider ones are averaged down to it
 
 
@@ -66,8 +68,19 @@ def watch_video(flags: WatchFlags) -> list[Path]:
     if flags.mono and flags.stereo is not None:
         raise InputError("expected --mono or --stereo, got both; leave one out")
     given = {name: getattr(flags, name) for name in lgmd.SCALARS}
-    params = replace(lgmd.Params(), **{name: value for name, value in given.items() if value is not None})
-    layout = StereoLayout(stereo=flags.stereo is not None, overlap=flags.overlap, width=flags.width)
+    if not 0 < flags.fov <= 360:
+        raise InputError(
+            f"expected --fov of more than 0 to 360 degrees, got {flags.fov}; 170 is that of the robot's eyes"
+        )
+    params = lgmd.Params(
+        **{name: value for name, value in given.items() if value is not None},
+        pooling=flags.pooling,
+        falloff=flags.falloff,
+        edges=hemifield.edges(math.radians(flags.fov), flags.overlap),
+    )
+    layout = StereoLayout(
+        stereo=flags.stereo is not None, overlap=flags.overlap, ground=flags.ground, width=flags.width
+    )
     return detect_looming(
         flags.video, flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
     )
@@ -180,13 +193,14 @@ def _scaled_size(path: Path, video: video_io.Video, layout: StereoLayout) -> tup
 def _split(picture: UInt8[np.ndarray, "height width"], layout: StereoLayout) -> Float[np.ndarray, "2 height eye"]:
     """Cut the pictures of both eyes out of one frame."""
     pictures = np.split(picture, 2, axis=1) if layout.stereo else [picture, picture]
-    crops = [hemifield.crop(whole, side, overlap=layout.overlap) for side, whole in enumerate(pictures)]
+    field = {"overlap": layout.overlap, "ground": layout.ground}
+    crops = [hemifield.crop(whole, side, **field) for side, whole in enumerate(pictures)]
     return np.stack(crops).astype(jnp.result_type(float))
 
 
 @jax.jit
 def _init(params: lgmd.Params, pictures: Float[Array, "2 height eye"]) -> lgmd.State:
-    return jax.vmap(partial(lgmd.init, params))(pictures)
+    return jax.vmap(partial(lgmd.init, params))(_outermost_first(params, pictures))
 
 
 @jax.jit
@@ -197,9 +211,22 @@ def _step(
 
     The layers are also returned without an overlay: another program would round u otherwise.
     """
+    pictures = _outermost_first(params, pictures)
     layers = jax.vmap(partial(lgmd.layers, params))(states, pictures)
     states, response = jax.vmap(partial(lgmd.step, params))(states, pictures)
-    return states, jnp.stack([response.u, response.feed_forward, response.excitation]), layers
+    shown = jax.tree.map(partial(_to_pixels, params, pictures.shape[1:]), layers)
+    return states, jnp.stack([response.u, response.feed_forward, response.excitation]), shown
+
+
+def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns"]) -> Float[Array, "2 rows columns"]:
+    """Mirror the right picture if its columns have weights; without, u would round otherwise than before."""
+    return hemifield.outermost_first(pictures) if params.falloff else pictures
+
+
+def _to_pixels(params: lgmd.Params, shape: tuple[int, int], layer: Float[Array, "2 rows columns"]) -> Array:
+    """Return a layer with a value for each pixel, in the order of the picture."""
+    rows, columns = (np.arange(pixels) * cells // pixels for pixels, cells in zip(shape, layer.shape[1:], strict=True))
+    return _outermost_first(params, layer)[:, rows][:, :, columns]
 
 
 def _process(
@@ -260,6 +287,7 @@ def _table(
 
 def _metadata(path: Path, video: video_io.Video, layout: StereoLayout, params: lgmd.Params) -> dict[str, str]:
     constants = {name: float(getattr(params, name)) for name in lgmd.SCALARS}
-    facts = {"units": UNITS, "eyes": asdict(layout), "lgmd": constants, "rate": float(video.rate)}
+    seen = {"pooling": params.pooling, "falloff": params.falloff}
+    facts = {"units": UNITS, "eyes": asdict(layout) | seen, "lgmd": constants, "rate": float(video.rate)}
     name = os.fsencode(path.name).decode("utf-8", "replace")
     return {"video": name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}

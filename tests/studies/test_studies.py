@@ -153,6 +153,14 @@ def test_an_erratum_changes_one_thing(robot):
         changed = {path for path in before if not np.array_equal(before[path], after[path])}
         own = ("coupling", "full_turn", "tie_tolerance", "corridor", "base")  # of W, or of the rule
         assert changed and all(any(word in path for word in own) for path in changed)
+    eyes = assembly.camera_settings(robot)
+    for part, field in (
+        ("whole width", {"overlap": 1.0}),
+        ("with the ground", {"ground": 0.0}),
+        ("equal weights", {"falloff": 0.0}),
+    ):
+        changed = errata.CASES[f"sec. 3.3: {part}"](robot, Path())
+        assert assembly.camera_settings(changed) == replace(eyes, **field) != eyes
     assert errata.CASES["eq. 16: gate"](robot, Path()).controller.lgmd.printed_gate
     assert errata.CASES["eq. 15: signed sum"](robot, Path()).controller.lgmd.printed_feed_forward
     assert errata.CASES["eqs. 1, 3: sign of w_fe"](robot, Path()).controller.cpg.printed_sign
