@@ -40,6 +40,7 @@ from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import partial_files
 from lgmdjax.sensors import hemifield
+from lgmdjax.sensors.settings import check_field
 
 MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third is the first with all of it
 MIN_SIZE = 16  # px, smallest width and height of the picture of an eye
@@ -68,6 +69,7 @@ def watch_video(flags: WatchFlags) -> list[Path]:
     if flags.mono and flags.stereo is not None:
         raise InputError("expected --mono or --stereo, got both; leave one out")
     given = {name: getattr(flags, name) for name in lgmd.SCALARS}
+    check_field(overlap=flags.overlap, ground=flags.ground, falloff=flags.falloff)
     if not 0 < flags.fov <= 360:
         raise InputError(
             f"expected --fov of more than 0 to 360 degrees, got {flags.fov}; 170 is that of the robot's eyes"
@@ -225,8 +227,11 @@ def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns
 
 def _to_pixels(params: lgmd.Params, shape: tuple[int, int], layer: Float[Array, "2 rows columns"]) -> Array:
     """Return a layer with a value for each pixel, in the order of the picture."""
-    rows, columns = (np.arange(pixels) * cells // pixels for pixels, cells in zip(shape, layer.shape[1:], strict=True))
-    return _outermost_first(params, layer)[:, rows][:, :, columns]
+    if params.pooling > 1:
+        sizes = zip(shape, layer.shape[1:], strict=True)
+        rows, columns = (np.arange(pixels) * cells // pixels for pixels, cells in sizes)
+        layer = layer[:, rows][:, :, columns]
+    return _outermost_first(params, layer)
 
 
 def _process(
