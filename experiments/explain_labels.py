@@ -38,6 +38,7 @@ FIELDS = {
     "without the ground": {"ground": 0.5, "falloff": 0.0},
     "with falloff": {"ground": 0.0, "falloff": 2.0},
     "without the ground, with falloff": {"ground": 0.5, "falloff": 2.0},
+    "without the ground, with more falloff": {"ground": 0.5, "falloff": 3.0},
 }
 
 
@@ -85,7 +86,7 @@ def main(run: tyro.conf.Positional[Path]) -> None:
     rounds = sorted({walk.episode for walk in walks})[-ROUNDS:]
     walks = [walk for walk in walks if walk.episode in rounds]
     for name, field in FIELDS.items():
-        score(f"u, {name}", render(walks, run, replace(CameraSettings(**header["eyes"]), **field)))
+        score(f"u, {name}", render(walks, run, replace(assembly.read_camera_settings(header), **field)))
     score("u, as recorded", walks)
     score("u, as recorded, ten times the weights", walks, LARGE)
     score("1/r, of the teacher", [nearness(walk) for walk in walks])

@@ -29,7 +29,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from lgmdjax.body import implicit_step
-from lgmdjax.errors import InputError
+from lgmdjax.errors import InputError, one_line
 from lgmdjax.geometry import rotation_matrix
 from lgmdjax.paths import MJCF_DIRS
 from lgmdjax.runtime.mjx import mjx
@@ -88,9 +88,8 @@ def load(path: Path | str | None = None) -> mujoco.MjModel:
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        reason = " ".join(str(error).split())
         raise InputError(
-            f"expected a MuJoCo model in {path}, got one that does not compile ({reason}); correct it"
+            f"expected a MuJoCo model in {path}, got one that does not compile ({one_line(error)}); correct it"
         ) from None
     servos = [model.actuator(i).name for i in range(model.nu)]
     expected = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]

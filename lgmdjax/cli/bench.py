@@ -7,7 +7,7 @@ from lgmdjax.evaluation import stimulus_scores
 from lgmdjax.evaluation.settings import STIMULUS_SCALES
 from lgmdjax.reporting.figures import stimulus_scores as figure
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import partial_files, storage
 from lgmdjax.runtime.storage import JsonObject
 
 COLUMNS = ("detector", "AUC dark", "AUC bright", *figure.GROUPS, "slope", "intercept [ms]", "r")
@@ -23,7 +23,7 @@ def run_bench(flags: BenchFlags) -> Iterator[str]:
     for name in names:
         rows.append(stimulus_scores.score(name, clips))
         yield f"{name}: area under ROC {rows[-1]['auc_dark']:.2f} (dark), {rows[-1]['auc_bright']:.2f} (bright)"
-    with storage.replacing_all(flags.out / f"{flags.on}-{flags.scale}") as folder:
+    with partial_files.replacing_all(flags.out / f"{flags.on}-{flags.scale}") as folder:
         storage.write_json(folder / "scores.json", rows)
         (folder / "scores.md").write_text(table(rows), encoding="utf-8")
         (folder / "scores.png").write_bytes(style.to_png(figure.plot(rows)))
@@ -32,7 +32,7 @@ def run_bench(flags: BenchFlags) -> Iterator[str]:
 
 
 def _expand(name: str) -> Sequence[str]:
-    return tuple(stimulus_scores.CONTESTANTS) if name == "all" else (name,)
+    return tuple(stimulus_scores.DETECTORS) if name == "all" else (name,)
 
 
 def table(rows: Sequence[JsonObject]) -> str:

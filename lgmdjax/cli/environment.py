@@ -6,7 +6,7 @@ from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import jax_setup
 
 
-def start_jax() -> None:
+def check_jax() -> None:
     """Make JAX check what it reads from its cache; raise `InputError` for variables that JAX can't be started with."""
     jax_setup.check_variables()
     from lgmdjax.runtime import program_cache

@@ -110,7 +110,15 @@ class WatchFlags:
     overlay: bool = True
     """write the video with the responses drawn over it; more than twice as fast without"""
     overlap: float = 0.5
-    """fraction of its picture that each eye sees, from 0.5 (its half) to 1 (all of it)"""
+    """fraction of its picture's width that each eye sees, from 0.5 (its half) to 1 (all of it)"""
+    ground: float = 0.0
+    """fraction of its picture's height, at the bottom, that no eye sees"""
+    falloff: float = 0.0
+    """how much less cells weigh beside the way than ahead; 2 in the pretrained robot, 0 is not at all"""
+    fov: float = 170.0
+    """horizontal field of view of a picture [deg], by which --falloff knows what is beside the way"""
+    pooling: int = 1
+    """width of a detector's cell [px]"""
     width: int = 320
     """wider pictures are averaged down to this width [px]"""
     threshold: float | None = None

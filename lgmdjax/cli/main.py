@@ -64,7 +64,7 @@ def trial(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_trial(_summary(trial), arguments)
-    environment.start_jax()
+    environment.check_jax()
     from lgmdjax.cli.trial import run_trials
 
     for line in run_trials(given):
@@ -78,7 +78,7 @@ def study(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_study(name, STUDIES[name], arguments[1:])
-    environment.start_jax()
+    environment.check_jax()
     from lgmdjax.cli.study import run_study
 
     print(f"look into {run_study(name, given)}")
@@ -89,7 +89,7 @@ def watch(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_watch(_summary(watch), arguments)
-    environment.start_jax()
+    environment.check_jax()
     from lgmdjax.cli.watch import watch_video
 
     for file in watch_video(given):
@@ -101,7 +101,7 @@ def export(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_export(_summary(export), arguments)
-    environment.start_jax()
+    environment.check_jax()
     from lgmdjax.cli.export import export_robot
 
     for line in export_robot(given):
@@ -113,7 +113,7 @@ def bench(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_bench(_summary(bench), arguments)
-    environment.start_jax()
+    environment.check_jax()
     from lgmdjax.cli.bench import run_bench
 
     for line in run_bench(given):
@@ -272,7 +272,7 @@ def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequen
 
     name = command.__name__.replace("_", "-")
     given = flags.parse_pipeline(name, _summary(command), arguments)
-    environment.start_jax()
+    environment.check_jax()
     from lgmdjax.runtime.run_folders import execute, open_run
 
     run = open_run(given.out, given.name, given.scale, given.seed, given.settings)

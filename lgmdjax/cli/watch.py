@@ -12,10 +12,11 @@ Writes to a folder with the full name of the video:
 
 import contextlib
 import json
+import math
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -37,14 +38,13 @@ from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import partial_files
 from lgmdjax.sensors import hemifield
+from lgmdjax.sensors.settings import check_field
 
 MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third is the first with all of it
 MIN_SIZE = 16  # px, smallest width and height of the picture of an eye
 NOMINAL_RATE = 30  # Hz, of the robot's cameras
-SIDES = ("left", "right")
-CONSTANTS = ("threshold", "suppression", "inhibition")  # of the detector, which the command line can change
 TableFormat = Literal["csv", "parquet"]
 UNITS = {
     "time": "s",
@@ -60,6 +60,7 @@ class StereoLayout:
 
     stereo: bool = False  # each frame holds two pictures, side by side
     overlap: float = 0.5  # fraction of the picture's width that an eye sees, from its own side
+    ground: float = 0.0  # fraction of its height, at the bottom, that no eye sees
     width: int = 320  # px of one picture; wider ones are averaged down to it
 
 
@@ -67,9 +68,21 @@ def watch_video(flags: WatchFlags) -> list[Path]:
     """Run both detectors on the video of the flags, and return the written files."""
     if flags.mono and flags.stereo is not None:
         raise InputError("expected --mono or --stereo, got both; leave one out")
-    given = {name: getattr(flags, name) for name in CONSTANTS}
-    params = replace(lgmd.Params(), **{name: value for name, value in given.items() if value is not None})
-    layout = StereoLayout(stereo=flags.stereo is not None, overlap=flags.overlap, width=flags.width)
+    given = {name: getattr(flags, name) for name in lgmd.SCALARS}
+    check_field(overlap=flags.overlap, ground=flags.ground, falloff=flags.falloff)
+    if not 0 < flags.fov <= 360:
+        raise InputError(
+            f"expected --fov of more than 0 to 360 degrees, got {flags.fov}; 170 is that of the robot's eyes"
+        )
+    params = lgmd.Params(
+        **{name: value for name, value in given.items() if value is not None},
+        pooling=flags.pooling,
+        falloff=flags.falloff,
+        edges=hemifield.edges(math.radians(flags.fov), flags.overlap),
+    )
+    layout = StereoLayout(
+        stereo=flags.stereo is not None, overlap=flags.overlap, ground=flags.ground, width=flags.width
+    )
     return detect_looming(
         flags.video, flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
     )
@@ -95,7 +108,7 @@ def detect_looming(
         eyes = _split(np.zeros((height, width), np.uint8), layout)
         overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
         _print_notes(path, video)
-        with storage.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
+        with partial_files.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
             samples, excitations = _process(
                 frames, layout, params, overlay=overlay_layout, target=partial_folder / "overlay.mp4", rate=video.rate
             )
@@ -127,7 +140,7 @@ def plot(responses: pa.Table, params: lgmd.Params) -> Figure:
     figure = Figure(figsize=(style.WIDTH, 3.4))
     upper, lower = figure.subplots(2, 1, sharex=True)
     time = responses["time"].to_numpy()
-    for side, colour in zip(SIDES, (style.LEFT_COLOUR, style.RIGHT_COLOUR), strict=True):
+    for side, colour in zip(hemifield.SIDES, (style.LEFT_COLOUR, style.RIGHT_COLOUR), strict=True):
         upper.plot(time, responses[f"u_{side}"].to_numpy(), color=colour, label=f"{side} eye")
         lower.plot(time, responses[f"feed_forward_{side}"].to_numpy(), color=colour)
     lower.axhline(float(params.suppression), color=style.GREY, linestyle=":", label="T_f")
@@ -182,13 +195,14 @@ def _scaled_size(path: Path, video: video_io.Video, layout: StereoLayout) -> tup
 def _split(picture: UInt8[np.ndarray, "height width"], layout: StereoLayout) -> Float[np.ndarray, "2 height eye"]:
     """Cut the pictures of both eyes out of one frame."""
     pictures = np.split(picture, 2, axis=1) if layout.stereo else [picture, picture]
-    crops = [hemifield.crop(whole, side, overlap=layout.overlap) for side, whole in enumerate(pictures)]
+    field = {"overlap": layout.overlap, "ground": layout.ground}
+    crops = [hemifield.crop(whole, side, **field) for side, whole in enumerate(pictures)]
     return np.stack(crops).astype(jnp.result_type(float))
 
 
 @jax.jit
 def _init(params: lgmd.Params, pictures: Float[Array, "2 height eye"]) -> lgmd.State:
-    return jax.vmap(partial(lgmd.init, params))(pictures)
+    return jax.vmap(partial(lgmd.init, params))(_outermost_first(params, pictures))
 
 
 @jax.jit
@@ -199,9 +213,25 @@ def _step(
 
     The layers are also returned without an overlay: another program would round u otherwise.
     """
+    pictures = _outermost_first(params, pictures)
     layers = jax.vmap(partial(lgmd.layers, params))(states, pictures)
     states, response = jax.vmap(partial(lgmd.step, params))(states, pictures)
-    return states, jnp.stack([response.u, response.feed_forward, response.excitation]), layers
+    shown = jax.tree.map(partial(_to_pixels, params, pictures.shape[1:]), layers)
+    return states, jnp.stack([response.u, response.feed_forward, response.excitation]), shown
+
+
+def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns"]) -> Float[Array, "2 rows columns"]:
+    """Mirror the right picture if its columns have weights; without, u would round otherwise than before."""
+    return hemifield.outermost_first(pictures) if params.falloff else pictures
+
+
+def _to_pixels(params: lgmd.Params, shape: tuple[int, int], layer: Float[Array, "2 rows columns"]) -> Array:
+    """Return a layer with a value for each pixel, in the order of the picture."""
+    if params.pooling > 1:
+        sizes = zip(shape, layer.shape[1:], strict=True)
+        rows, columns = (np.arange(pixels) * cells // pixels for pixels, cells in sizes)
+        layer = layer[:, rows][:, :, columns]
+    return _outermost_first(params, layer)
 
 
 def _process(
@@ -253,7 +283,7 @@ def _table(
 ) -> pa.Table:
     """Return the responses as a table with one row for each frame."""
     columns: dict[str, object] = {"frame": range(len(samples)), "time": [sample.time for sample in samples]}
-    for side, name in enumerate(SIDES):
+    for side, name in enumerate(hemifield.SIDES):
         columns[f"u_{name}"] = [sample.u[side] for sample in samples]
         columns[f"feed_forward_{name}"] = [sample.feed_forward[side] for sample in samples]
         columns[f"excitation_{name}"] = [pair[side] for pair in excitations]
@@ -261,7 +291,8 @@ def _table(
 
 
 def _metadata(path: Path, video: video_io.Video, layout: StereoLayout, params: lgmd.Params) -> dict[str, str]:
-    constants = {name: float(getattr(params, name)) for name in CONSTANTS}
-    facts = {"units": UNITS, "eyes": asdict(layout), "lgmd": constants, "rate": float(video.rate)}
+    constants = {name: float(getattr(params, name)) for name in lgmd.SCALARS}
+    seen = {"pooling": params.pooling, "falloff": params.falloff}
+    facts = {"units": UNITS, "eyes": asdict(layout) | seen, "lgmd": constants, "rate": float(video.rate)}
     name = os.fsencode(path.name).decode("utf-8", "replace")
     return {"video": name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}

@@ -134,8 +134,8 @@ def memory(params: Params) -> dict[str, int]:
     size = sizes(params)
     pooled = size["ROWS"] * size["COLUMNS"]
     bordered = (size["ROWS"] + 2 * size["RADIUS"]) * (size["COLUMNS"] + 2 * size["RADIUS"])
-    brain = 2 * size["VIEWS"] * size["UNITS"] + 2 + 2 * cpg.LEGS * 2
-    state = 2 * (pooled + bordered) + brain + pooled + 1
+    navigator_and_cpg = 2 * size["VIEWS"] * size["UNITS"] + 2 + 2 * cpg.LEGS * 2
+    state = 2 * (pooled + bordered) + navigator_and_cpg + pooled + 1
     return {"state": 4 * state, "constants": 4 * sum(np.size(constant.value) for constant in constants(params))}
 
 

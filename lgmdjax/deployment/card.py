@@ -15,7 +15,6 @@
 | versions | of the packages that exported it                                                                |
 """
 
-import hashlib
 import math
 from importlib.metadata import version
 from pathlib import Path
@@ -31,14 +30,13 @@ from lgmdjax.deployment import c_source, nervous_system, onnx_graph
 from lgmdjax.deployment.nervous_system import Params
 from lgmdjax.detectors import lgmd
 from lgmdjax.locomotion import tripod_gait
-from lgmdjax.runtime import versions
+from lgmdjax.runtime import checksums, versions
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import hemifield
 from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS
 
 FILE = "card.json"
 FORMAT, VERSION = "lgmdjax nervous system", 1
-SIDES = ["left", "right"]
 ZERO = "leg straight out along its mount, femur level, tibia plumb; positive coxa turns left, femur and tibia lift"
 
 
@@ -54,7 +52,7 @@ def describe(params: Params) -> JsonObject:
         "lgmd": _lgmd(params),
         "velocity": {
             "unit": f"{tripod_gait.Gait().nominal_velocity} m/s",
-            "order": SIDES,
+            "order": list(hemifield.SIDES),
             "range": [policies.GAIT_RANGE.min_velocity, policies.GAIT_RANGE.max_velocity],
         },
         "servos": _servos(params),
@@ -69,7 +67,7 @@ def describe(params: Params) -> JsonObject:
 def describe_files(folder: Path) -> JsonObject:
     """Return size and hash of each file in a folder."""
     return {
-        path.name: {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        path.name: {"bytes": path.stat().st_size, "sha256": checksums.digest(path.read_bytes())}
         for path in sorted(folder.iterdir())
     }
 
@@ -78,7 +76,7 @@ def _eyes(params: Params) -> JsonObject:
     camera = params.camera
     level = hexapod.Pose(position=jnp.zeros(3), quaternion=jnp.array([1.0, 0.0, 0.0, 0.0]))
     return {
-        "order": SIDES,
+        "order": list(hemifield.SIDES),
         "width": camera.width,
         "height": camera.height,
         "pixels": "uint8, 0 black to 255 white, top row first",

@@ -18,7 +18,7 @@ from lgmdjax.deployment import c_source, card, nervous_system, onnx_graph, stabl
 from lgmdjax.deployment.formats import FORMATS, PRETRAINED, Format
 from lgmdjax.errors import InputError
 from lgmdjax.paths import PRETRAINED_DIR
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import partial_files, storage
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly
 
@@ -45,15 +45,15 @@ def export(run: Path | None, out: Path, *, width: int | None = None, formats: Se
     """
     if "onnx" in formats:
         onnx_graph.check_installed()
-    storage.require_empty(out)
+    partial_files.require_empty(out)
     gait_folder, train_folder = _stage_folders(run)
     with jax.enable_x64(False):
         robot = assembly.load_robot(gait_folder, train_folder)
         if width is not None:
-            robot = assembly.with_camera(robot, assembly.scale_camera(robot, width))
+            robot = assembly.with_resolution(robot, assembly.scale_resolution(robot, width))
         params = nervous_system.from_robot(robot)
         name = PRETRAINED if run is None else run.resolve().name
-        with storage.new_folder(out) as folder:
+        with partial_files.new_folder(out) as folder:
             _write_programs(folder, params, f"robot {name} ({assembly.fingerprint(robot)})", formats)
             facts = {
                 **card.describe(params),

@@ -10,7 +10,7 @@
 | emd            | Hassenstein & Reichardt 1956: elementary motion detectors                  |
 | grm            | Chalupka et al. 2016: generalised regressive motion                        |
 | lplc2          | fruit fly, Klapoetke et al. 2017 and Zhou et al. 2022: outward motion      |
-| eta, tau       | ideal observers that are told the geometry: Gabbiani et al. 1999, Lee 1976 |
+| eta, tau       | ideal observers, which get the geometry: Gabbiani et al. 1999, Lee 1976 |
 | cells, on_off  | what several of them share                                                 |
 """
 

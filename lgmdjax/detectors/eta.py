@@ -1,6 +1,6 @@
 """The eta function: how a locust's LGMD fires, as a function of an object's true size and expansion.
 
-An ideal observer, told the geometry that other detectors have to see: a ceiling for them, not a competitor.
+An ideal observer, which gets the geometry that other detectors have to see: an upper bound for them.
 
 | symbol | name                | unit   | equation                                               |
 | ------ | ------------------- | ------ | ------------------------------------------------------ |

@@ -65,6 +65,7 @@ from lgmdjax.errors import InputError
 
 KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
 U_AT_REST = cells.U_AT_REST
+SCALARS = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I: what is calibrated
 FULL_WEIGHT_BEARING = math.radians(20.0)  # theta_0, up to which all cells have the same weight
 
 # w_I (eq. 9)
@@ -219,7 +220,7 @@ def with_smooth_thresholds(params: Params, relative_width: Float[Array, ""] | fl
 
 def check(params: Params) -> None:
     """Raise `InputError` if a constant is negative or not finite, or if the kernel is not symmetric."""
-    for name in ("threshold", "suppression", "inhibition", "kernel"):
+    for name in (*SCALARS, "kernel"):
         value = np.asarray(getattr(params, name), dtype=float)
         if not np.all(np.isfinite(value) & (value >= 0)):
             raise InputError(f"lgmd {name}: expected finite numbers >= 0, got {value.min()}; see lgmd.Params")

@@ -8,7 +8,7 @@
 | Response | has `u`, 0.5 without motion and up to 1, and `excitation`, which is not squashed; anything else is extra |
 
 Every detector of this package is one, and so is the template of the page "Write your own detector". The ideal observers
-are of the same form, but are told the object's true size instead of seeing a frame.
+are of the same form, but get the object's true size in the place of a frame.
 """
 
 from collections.abc import Callable

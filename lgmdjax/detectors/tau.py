@@ -1,6 +1,6 @@
 """Tau: the time to contact, from an object's true size and expansion.
 
-An ideal observer, told the geometry that other detectors have to see: a ceiling for them, not a competitor.
+An ideal observer, which gets the geometry that other detectors have to see: an upper bound for them.
 
 | symbol | name                | unit   | equation                                                     |
 | ------ | ------------------- | ------ | ------------------------------------------------------------ |

@@ -89,8 +89,7 @@ def run_trial(
     ```
     """
     _check(trial, policy, seeds)
-    robot = assembly.load_robot(run / "fit-gait", run / "train") if run else assembly.load_robot()
-    robot = robot if width is None else assembly.with_camera(robot, assembly.scale_camera(robot, width))
+    robot = _load_robot(run, width)
     definition = trials.TRIALS[trial]
     trial_run = describe_run(robot, trial, policy, seeds or definition.seeds, definition.seconds)
 
@@ -101,6 +100,11 @@ def run_trial(
     name, remedy = f"{trial}-{policy}-{seed}", "choose another --out or --seed"
     place = open_run(out, name, "trial", seed, settings, remedy=remedy)
     return execute(place, (Stage(name="trial", run=work),), "trial")
+
+
+def _load_robot(run: Path | None, width: int | None) -> closed_loop.Params:
+    robot = assembly.load_robot(run / "fit-gait", run / "train") if run else assembly.load_robot()
+    return robot if width is None else assembly.with_resolution(robot, assembly.scale_resolution(robot, width))
 
 
 def _check(trial: str, policy: str, seeds: int | None) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.sensors.settings import Resolution
 
 TrialName = Literal[
     "testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "gap", "gap-70cm", "gap-60cm", "white", "corner"
@@ -39,8 +39,8 @@ class TrialPlan:
     """One trial of stage evaluate: with which policies, how often, and for how long."""
 
     trial: TrialName  # name of the trial
-    eyes: CameraSettings  # camera settings of the learned policy
+    eyes: Resolution  # of the learned policy's eyes
     seeds: int  # number of repetitions, each with its own textures and start poses
-    coarse: CameraSettings | None = None  # camera settings of all other policies; the same as `eyes` if None
+    coarse: Resolution | None = None  # of all other policies' eyes; the same as `eyes` if None
     seconds: float | None = None  # duration of each walk [s]; as long as the trial says if None
     policies: tuple[PolicyName, ...] = POLICY_NAMES  # names of the policies

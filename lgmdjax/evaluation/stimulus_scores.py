@@ -51,8 +51,8 @@ FLY_CELL = np.radians(5.0)  # width of a cell of the fly's detectors
 OTHERS = ("recede", "translate", "elongate", "grating", "yaw", "sway", "flash")  # what does not approach
 
 
-class Contestant(NamedTuple):
-    """A detector, its parameters for an eye, and whether it is told the geometry instead of seeing frames."""
+class DetectorSetup(NamedTuple):
+    """A detector, its parameters for an eye, and whether it gets the geometry in the place of frames."""
 
     detector: protocol.Detector
     params: Callable[[camera.Params], PyTree]
@@ -68,38 +68,38 @@ class Bench(NamedTuple):
     noise: Clips
 
 
-def _published(detector: Any, is_ideal: bool = False) -> Contestant:
-    return Contestant(detector, lambda _: detector.Params(), is_ideal)
+def _published(detector: Any, is_ideal: bool = False) -> DetectorSetup:
+    return DetectorSetup(detector, lambda _: detector.Params(), is_ideal)
 
 
 def _correlators(eye: camera.Params) -> emd.Params:
     return emd.Params(pooling=max(round(float(FLY_CELL) * eye.width / eye.fov), 1))
 
 
-CONTESTANTS: Mapping[str, Contestant] = {
+DETECTORS: Mapping[str, DetectorSetup] = {
     "lgmd": _published(lgmd),
     "lgmd1_grouping": _published(lgmd1_grouping),
     "lgmd1_onoff": _published(lgmd1_onoff),
     "lgmd2": _published(lgmd2),
     "d_lgmd": _published(d_lgmd),
-    "emd": Contestant(emd, _correlators),
-    "grm": Contestant(grm, lambda eye: grm.Params(motion=_correlators(eye))),
-    "lplc2": Contestant(lplc2, lambda eye: lplc2.Params(motion=_correlators(eye))),
+    "emd": DetectorSetup(emd, _correlators),
+    "grm": DetectorSetup(grm, lambda eye: grm.Params(motion=_correlators(eye))),
+    "lplc2": DetectorSetup(lplc2, lambda eye: lplc2.Params(motion=_correlators(eye))),
     "eta": _published(eta, is_ideal=True),
     "tau": _published(tau, is_ideal=True),
 }
 """Detectors by name. Their time constants are for 30 frames a second."""
 
 
-def find(name: str) -> Contestant:
+def find(name: str) -> DetectorSetup:
     """Return a detector by its name here, by `module:attribute`, or by `module:` for a module that is one.
 
     >>> find("lgmdjax.detectors:lgmd2").detector.__name__
     'lgmdjax.detectors.lgmd2'
     """
-    if name in CONTESTANTS:
-        return CONTESTANTS[name]
-    expected = f"expected a detector among {', '.join(CONTESTANTS)}, or module:attribute"
+    if name in DETECTORS:
+        return DETECTORS[name]
+    expected = f"expected a detector among {', '.join(DETECTORS)}, or module:attribute"
     if ":" not in name:
         raise InputError(f"{expected}, got {name}; choose one")
     try:
@@ -124,15 +124,15 @@ def make_bench(settings: StimulusBench, seed: int) -> Bench:
 
 def score(name: str, bench: Bench) -> JsonObject:
     """Run a detector on all clips and return its scores."""
-    contestant = find(name)
+    setup = find(name)
     height, width = bench.selection.frames.shape[2:]
-    params = contestant.params(camera.Params(width=width, height=height))
-    u = {part: respond(contestant, params, clips) for part, clips in bench._asdict().items()}
+    params = setup.params(camera.Params(width=width, height=height))
+    u = {part: respond(setup, params, clips) for part, clips in bench._asdict().items()}
     peaks = {part: np.max(response[:, FIRST:], axis=1) for part, response in u.items()}
     named = dict(zip(bench.selection.names, peaks["selection"].tolist(), strict=True))
     return {
         "detector": name,
-        "is_ideal": contestant.is_ideal,
+        "is_ideal": setup.is_ideal,
         "peaks": named,
         **compare(named),
         "timing": time_peaks(u["timing"], bench.timing),
@@ -145,10 +145,10 @@ def score(name: str, bench: Bench) -> JsonObject:
     }
 
 
-def respond(contestant: Contestant, params: PyTree, clips: Clips) -> Float[np.ndarray, "clips frames"]:
+def respond(setup: DetectorSetup, params: PyTree, clips: Clips) -> Float[np.ndarray, "clips frames"]:
     """Return u - 0.5 for every frame after the first of every clip."""
-    inputs = clips.geometry if contestant.is_ideal else jnp.asarray(clips.frames, float)
-    return np.asarray(_respond(contestant.detector.init, contestant.detector.step, params, inputs)) - 0.5
+    inputs = clips.geometry if setup.is_ideal else jnp.asarray(clips.frames, float)
+    return np.asarray(_respond(setup.detector.init, setup.detector.step, params, inputs)) - 0.5
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -21,7 +21,7 @@ from lgmdjax.control import names, navigator, policies
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import metrics
 from lgmdjax.learning import behaviour_cloning, sequences
-from lgmdjax.learning.settings import TrainSettings
+from lgmdjax.learning.settings import DaggerSettings, TrainSettings
 from lgmdjax.locomotion import cpg
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, room_batches
@@ -79,7 +79,7 @@ def run(
     folder: Path,
     robot: closed_loop.Params,
     walks: list[Walk],
-    settings: TrainSettings,
+    settings: DaggerSettings,
     seed: int,
     *,
     variant: names.Variant = "lstm",
@@ -133,14 +133,18 @@ def select_turn_gain(
     for turn_gain in settings.turn_gains:
         candidates.append(behaviour_cloning.rescale_turns(fit.best, test, turn_gain))
         record = _walk_with_gain(folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed)
-        score = metrics.score(record, cpg.CYCLE_TIME)
-        row = {"caution": turn_gain, "tight": count_approaches(record)}
-        coverage = score.progress.coverage.value
-        rows.append(row | {"collisions": score.collisions, "distance": score.distance, "coverage": coverage})
+        rows.append({"caution": turn_gain} | _summarise(record))
     least = MIN_RELATIVE_COVERAGE * max(row["coverage"] for row in rows)
     going_on = [k for k, row in enumerate(rows) if row["coverage"] >= least]
     best = min(going_on, key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
     return candidates[best], [row | {"chosen": k == best} for k, row in enumerate(rows)]
+
+
+def _summarise(record: closed_loop.Record) -> JsonObject:
+    """Return what turn gains are compared by."""
+    score = metrics.score(record, cpg.CYCLE_TIME)
+    row = {"tight": count_approaches(record), "collisions": score.collisions, "distance": score.distance}
+    return row | {"coverage": score.progress.coverage.value}
 
 
 def count_approaches(record: closed_loop.Record) -> int:
@@ -178,7 +182,7 @@ def _run_round(
     folder: Path,
     robot: closed_loop.Params,
     walks: list[Walk],
-    settings: TrainSettings,
+    settings: DaggerSettings,
     *,
     seed: int,
     number: int,
@@ -218,7 +222,7 @@ def _walk_with_gain(
     robot: closed_loop.Params,
     params: navigator.Params,
     rooms: closed_loop.Room,
-    settings: TrainSettings,
+    settings: DaggerSettings,
     *,
     turn_gain: float,
     seed: int,

@@ -44,7 +44,6 @@ from lgmdjax.simulation import episodes
 from lgmdjax.simulation.closed_loop import FRAME_RATE, AnyArray
 from lgmdjax.simulation.episodes import Walk
 
-SCALARS = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
 PARTS = ("detector", "navigator")
 SMOOTH_WIDTHS = (0.3, 0.03)  # of the sigmoids, relative to T_s and T_f: first and last
 MIN_CONSTANT = 1e-3  # least constant whose logarithm is taken
@@ -141,13 +140,13 @@ def pack_walks(
 
 def to_fit_params(params: LgmdNavigator) -> dict[str, PyTree]:
     """Return all parameters that can be fitted, in the coordinates of the optimiser."""
-    logs = {name: jnp.log(jnp.maximum(getattr(params.detector, name), MIN_CONSTANT)) for name in SCALARS}
+    logs = {name: jnp.log(jnp.maximum(getattr(params.detector, name), MIN_CONSTANT)) for name in lgmd.SCALARS}
     return {"detector": logs | {"kernel": params.detector.kernel / KERNEL_RMS}, "navigator": params.navigator.weights}
 
 
 def from_fit_params(params: LgmdNavigator, fitted: FitParams) -> LgmdNavigator:
     """Return `params` with its fitted parameters replaced; the inverse of `to_fit_params`."""
-    constants = {name: jnp.exp(fitted["detector"][name]) for name in SCALARS}
+    constants = {name: jnp.exp(fitted["detector"][name]) for name in lgmd.SCALARS}
     return LgmdNavigator(
         detector=replace(params.detector, kernel=KERNEL_RMS * fitted["detector"]["kernel"], **constants),
         navigator=replace(params.navigator, weights=fitted["navigator"]),

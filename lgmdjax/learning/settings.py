@@ -2,19 +2,25 @@
 
 from dataclasses import dataclass
 
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.sensors.settings import Resolution
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainSettings:
-    """Training of the navigator and its variants: rounds of DAgger, then a final fit of every variant."""
+class DaggerSettings:
+    """Rounds of DAgger, and the fit after the last one."""
 
-    eyes: CameraSettings  # camera of the robot
     epochs: int  # number of epochs of the final fits
     dagger_rounds: int  # number of rounds of DAgger
     round_epochs: int  # number of epochs of the fit in each round
     robots: int  # number of robots in each round
     round_seconds: float  # simulated time of each robot in a round [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(DaggerSettings):
+    """Training of the navigator and its variants: rounds of DAgger, then a final fit of every variant."""
+
+    eyes: Resolution  # of the robot's eyes, which see the field of the recorded walks
     split_half_epochs: int = 80  # number of epochs of the fit to the teacher's walks split in halves, as in the paper
     variants: tuple[str, ...] = ("lstm", "lstm-efference", "feed-forward", "mean")  # networks to fit and compare
     turn_gains: tuple[float, ...] = ()  # turn gains to compare by walking; none: behaviour_cloning.TURN_GAIN

@@ -17,7 +17,7 @@ from lgmdjax.learning import lgmd_grid_search
 from lgmdjax.pipeline.settings import CollectSettings
 from lgmdjax.runtime.storage import JsonObject, write_json
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, rollout, room_batches
-from lgmdjax.simulation.assembly import CALIBRATED, load_detector
+from lgmdjax.simulation.assembly import load_detector
 
 CALIBRATION_EPISODE = 2**20  # an episode number beyond all others: its rooms are used nowhere else
 CALIBRATION_RULE = braitenberg.Params(corridor=0.0, turn_distance=0.95, full_turn_distance=0.6)
@@ -72,6 +72,6 @@ def _teacher_robot(gait: Path, settings: CollectSettings, detector: lgmd.Params)
 def _parameters(settings: CollectSettings, detector: lgmd.Params) -> JsonObject:
     """Return the header of the episodes; room i of episode k is the i-th of `training_rooms(seed, k, robots)`."""
     settings_used = {name: getattr(settings, name) for name in ("robots", "seconds")}
-    constants = {name: getattr(detector, name) for name in CALIBRATED}
+    constants = {name: getattr(detector, name) for name in lgmd.SCALARS}
     teacher = dataclasses.asdict(braitenberg.Params())
     return settings_used | {"eyes": dataclasses.asdict(settings.eyes), "lgmd": constants, "teacher": teacher}

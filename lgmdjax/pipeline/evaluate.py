@@ -28,7 +28,7 @@ from lgmdjax.reporting import selection
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime.storage import write_arrays, write_json
 from lgmdjax.sensors import camera
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.sensors.settings import Resolution
 from lgmdjax.simulation import assembly, closed_loop, episodes, rerender
 from lgmdjax.world import scenes
 
@@ -58,8 +58,8 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: EvaluateSettings, se
     write_arrays(folder / "trajectories.npz", _trajectories(continuing))
     shown = _one(records["testing"]["learned"], selection.select_walk(records["testing"]["learned"]))
     write_arrays(folder / "walk.npz", {name: getattr(shown, name) for name in episodes.FIELDS})
-    camera_settings = next(plan.eyes for plan in settings.trials if plan.trial == "testing")
-    write_arrays(folder / "layers.npz", _layers(robot.controller.lgmd, camera_settings, shown))
+    resolution = next(plan.eyes for plan in settings.trials if plan.trial == "testing")
+    write_arrays(folder / "layers.npz", _layers(robot.controller.lgmd, resolution, shown))
 
 
 def _record(
@@ -67,7 +67,7 @@ def _record(
 ) -> closed_loop.Record:
     """Record one policy in one trial, or read its walks if they are on disk."""
     coarse = None if policy == "learned" else plan.coarse
-    robot = assembly.with_camera(robot, coarse or plan.eyes)
+    robot = assembly.with_resolution(robot, coarse or plan.eyes)
     seconds = plan.seconds or trials.TRIALS[plan.trial].seconds
     trial_run = run_trial.describe_run(robot, plan.trial, policy, plan.seeds, seconds)
     return run_trial.record_trial(folder / plan.trial / policy, trial_run, robot, seed)[1]
@@ -108,15 +108,13 @@ def _one(record: closed_loop.Record, robot: int) -> closed_loop.Record:
     return jax.tree.map(lambda leaf: leaf[robot], record)
 
 
-def _layers(detector: lgmd.Params, camera_settings: CameraSettings, walk: closed_loop.Record) -> dict[str, np.ndarray]:
+def _layers(detector: lgmd.Params, resolution: Resolution, walk: closed_loop.Record) -> dict[str, np.ndarray]:
     """Render the frame that excited the left detector most; return its picture and layers (fig. 6b).
 
     The whole picture is rendered, at the paper's resolution.
     """
     fine = camera.Params()
-    detector = dataclasses.replace(
-        detector, pooling=max(camera_settings.pooling * fine.width // camera_settings.width, 1)
-    )
+    detector = dataclasses.replace(detector, pooling=max(resolution.pooling * fine.width // resolution.width, 1))
     steady = np.where(np.asarray(walk.resets) == walk.resets[-1], walk.excitation[:, 0], 0.0)
     last = max(int(np.argmax(steady)), 2)
     frames = jax.tree.map(lambda leaf: np.asarray(leaf)[None, last - 2 : last + 1], walk)

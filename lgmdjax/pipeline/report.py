@@ -32,9 +32,8 @@ from lgmdjax.pipeline.report_figures import NOMINAL_SPEED, TITLES, VARIANTS
 from lgmdjax.pipeline.settings import ReportSettings
 from lgmdjax.reporting import walk_video
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime.storage import JsonObject, read_arrays, replacing
-from lgmdjax.sensors.settings import CameraSettings
-from lgmdjax.simulation import assembly
+from lgmdjax.runtime import partial_files
+from lgmdjax.runtime.storage import JsonObject, read_arrays, read_file
 from lgmdjax.studies import supervision, velocity
 from lgmdjax.world import arena, scenes
 
@@ -81,7 +80,7 @@ def render(
     out = run_folder / "report" if out is None else out
     out.mkdir(parents=True, exist_ok=True)
     path = out / "index.html"
-    with replacing(path) as partial:
+    with partial_files.replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
     return path
 
@@ -90,8 +89,7 @@ def _contents(run_folder: Path, room: arena.Arena, video_seconds: float) -> Json
     """Return all variables of the template."""
     results = report_data.read_results(run_folder)
     onset, layers = read_arrays(run_folder / "fit-gait/cpg.npz"), read_arrays(run_folder / "evaluate/layers.npz")
-    size = next(plan["eyes"] for plan in results.settings["evaluate"]["trials"] if plan["trial"] == "testing")
-    camera_params = assembly.camera_params(CameraSettings(**size))
+    camera_params = report_data.testing_camera(results)
     return {
         **results._asdict(),
         "figures": _figures(run_folder, results, onset, room),
@@ -121,7 +119,7 @@ def _figures(
         **{name: report_data.STUDIES[name].plot(rows) for name, rows in results.studies.items()},
     }
     pictures = {name: style.to_svg(figure) for name, figure in figures.items()}
-    pictures |= {trial: (run_folder / f"evaluate/{trial}.svg").read_bytes() for trial in results.outcomes}
+    pictures |= {trial: read_file(run_folder / f"evaluate/{trial}.svg") for trial in results.outcomes}
     return {name: _inline("image/svg+xml", picture) for name, picture in pictures.items()}
 
 

@@ -85,6 +85,13 @@ def _with_present_names(content: Any) -> Any:
     return content
 
 
+def testing_camera(results: Results) -> camera.Params:
+    """Return the camera of the learned policy in the testing room: the trial's resolution, the detectors' field."""
+    size = next(plan["eyes"] for plan in results.settings["evaluate"]["trials"] if plan["trial"] == "testing")
+    field = {name: results.calibration[name] for name in ("overlap", "ground") if name in results.calibration}
+    return camera.Params(width=size["width"], height=size["height"], **field)
+
+
 def coarse_pictures(settings: JsonObject) -> dict[str, str]:
     """Return where pictures were smaller than the paper's, and their size."""
     train, plans = settings["train"].get("eyes"), settings["evaluate"]["trials"]

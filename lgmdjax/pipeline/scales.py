@@ -15,9 +15,9 @@ from collections.abc import Mapping
 from typing import Literal
 
 from lgmdjax.evaluation.settings import TrialPlan
-from lgmdjax.learning.settings import LgmdGradientSettings, TrainSettings
+from lgmdjax.learning.settings import DaggerSettings, LgmdGradientSettings, TrainSettings
 from lgmdjax.pipeline.settings import CollectSettings, EvaluateSettings, FitGaitSettings, ReportSettings
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.sensors.settings import CameraSettings, Resolution
 from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.studies.settings import (
     ErrataSettings,
@@ -46,16 +46,21 @@ StudySettings = (
     | FinetuneSettings
 )
 
-_FIELD: Mapping[str, float] = {"ground": 0.5, "falloff": 2.0}  # of the LGMDs (`lgmdjax.sensors.settings`)
-_SMALL = CameraSettings(width=64, height=48, pooling=2, **_FIELD)
-_QUICK = CameraSettings(width=80, height=60, pooling=3, **_FIELD)
-_MEDIUM = CameraSettings(width=160, height=120, pooling=6, **_FIELD)
-_PAPER = CameraSettings(width=320, height=240, pooling=12, **_FIELD)
+_SMALL = Resolution(width=64, height=48, pooling=2)
+_QUICK = Resolution(width=80, height=60, pooling=3)
+_MEDIUM = Resolution(width=160, height=120, pooling=6)
+_PAPER = Resolution(width=320, height=240, pooling=12)
+
+
+def _with_field(resolution: Resolution) -> CameraSettings:
+    """Return a camera whose LGMDs see what is above the horizon, and weigh most what is ahead."""
+    return CameraSettings(**vars(resolution), ground=0.5, falloff=2.0)
+
 
 SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
     "smoke": {
         "fit-gait": FitGaitSettings(steps=300, seconds=6),
-        "collect": CollectSettings(eyes=_QUICK, robots=4, episodes=2, seconds=10, calibration_seconds=5),
+        "collect": CollectSettings(eyes=_with_field(_QUICK), robots=4, episodes=2, seconds=10, calibration_seconds=5),
         "train": TrainSettings(
             eyes=_QUICK,
             epochs=5,
@@ -76,7 +81,7 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
     },
     "quick": {
         "fit-gait": FitGaitSettings(steps=3000, seconds=20),
-        "collect": CollectSettings(eyes=_QUICK, robots=16, episodes=2, seconds=45, calibration_seconds=20),
+        "collect": CollectSettings(eyes=_with_field(_QUICK), robots=16, episodes=2, seconds=45, calibration_seconds=20),
         "train": TrainSettings(
             eyes=_QUICK, epochs=80, dagger_rounds=3, round_epochs=60, robots=16, round_seconds=60, split_half_epochs=80
         ),
@@ -90,7 +95,9 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
     },
     "paper": {
         "fit-gait": FitGaitSettings(steps=6000, seconds=20),
-        "collect": CollectSettings(eyes=_PAPER, robots=16, episodes=2, seconds=28.125, calibration_seconds=30),
+        "collect": CollectSettings(
+            eyes=_with_field(_PAPER), robots=16, episodes=2, seconds=28.125, calibration_seconds=30
+        ),
         "train": TrainSettings(
             eyes=_QUICK,
             epochs=100,
@@ -119,7 +126,7 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
         "velocity": VelocitySettings(eyes=_MEDIUM, robots=16, distance=1.2),
         "supervision": SupervisionSettings(
             benchmark=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
-            dagger=TrainSettings(eyes=_QUICK, epochs=80, dagger_rounds=2, round_epochs=60, robots=16, round_seconds=60),
+            dagger=DaggerSettings(epochs=80, dagger_rounds=2, round_epochs=60, robots=16, round_seconds=60),
             demonstration_seconds=30,
             seeds=3,
         ),
@@ -160,7 +167,7 @@ STUDY_PRESETS: Mapping[str, StudySettings] = {
     ),
     "closed_loop_finetune": FinetuneSettings(
         benchmark=BenchmarkRooms(eyes=_QUICK, robots=16, seconds=90),
-        dagger=TrainSettings(eyes=_QUICK, epochs=80, dagger_rounds=2, round_epochs=60, robots=16, round_seconds=30),
+        dagger=DaggerSettings(epochs=80, dagger_rounds=2, round_epochs=60, robots=16, round_seconds=30),
         demonstration_seconds=30,
         window=15,
         horizons=(5, 45),

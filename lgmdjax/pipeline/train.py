@@ -39,21 +39,15 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     schema.check(assembly.BASELINES, baselines, "baselines", "collect again")
     write_arrays(folder / "baselines.npz", baselines)
     detector = assembly.load_detector(inputs["collect"])
-    robot = assembly.assemble_robot(inputs["fit-gait"], settings.eyes, detector, assembly.make_policies())
+    recorded_with = assembly.read_camera_settings(header)
+    robot = assembly.assemble_robot(inputs["fit-gait"], recorded_with, detector, assembly.make_policies())
+    robot = assembly.with_resolution(robot, settings.eyes)
     walks = dagger.run(folder, robot, recorded, settings, seed)
     train, test, unseen = dagger.split_rooms(episodes.segments(walks), seed)
     fits = _fit_variants(folder, train, test, settings, seed)
     rooms = {segment.room for segment in train}
-    # The paper splits every walk in half. A segment ends where the robot collided, so its second half is what a
-    # controller must learn most. For comparison, one fit uses the halves of the teacher's walks.
-    first, second = sequences.split_halves(
-        [segment for segment in episodes.segments(recorded) if segment.room in rooms]
-    )
-    halves = behaviour_cloning.Settings(epochs=settings.split_half_epochs)
-    fits["lstm-halves"] = behaviour_cloning.fit(
-        navigator.create(jax.random.key(seed), "lstm"), first, second, halves,
-        checkpoints=folder / "checkpoints" / "lstm-halves",
-    )  # fmt: skip
+    teachers = [segment for segment in episodes.segments(recorded) if segment.room in rooms]
+    fits["lstm-halves"] = _fit_halves(folder, teachers, settings, seed)
     sets = {"train": train, "test": test, "unseen": unseen}
     learned, turn_gains = dagger.select_turn_gain(folder, robot, fits["lstm"], test, settings, seed=seed)
     result = {
@@ -67,7 +61,8 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     }
     write_json(folder / "training.json", result)
     # The camera is that of the navigator's own walks, which are most of its training data.
-    facts = {"eyes": dataclasses.asdict(settings.eyes), "seed": seed, "training": dataclasses.asdict(settings)}
+    eyes = dataclasses.asdict(assembly.camera_settings(robot))
+    facts = {"eyes": eyes, "seed": seed, "training": dataclasses.asdict(settings)}
     navigator.save(folder / "controller.safetensors", learned, header | facts)
     write_arrays(folder / "prediction.npz", _prediction(learned, unseen))
 
@@ -84,6 +79,19 @@ def _fit_variants(
             checkpoints = folder / "checkpoints" / variant
             fits[variant] = behaviour_cloning.fit(start, train, test, fit_settings, checkpoints=checkpoints)
     return fits
+
+
+def _fit_halves(folder: Path, segments: list[Walk], settings: TrainSettings, seed: int) -> behaviour_cloning.FitResult:
+    """Fit the LSTM to the first halves of the teacher's walks, as the paper does, for comparison.
+
+    A segment ends where the robot collided, so its second half is what a controller must learn most.
+    """
+    first, second = sequences.split_halves(segments)
+    start, halves = navigator.create(jax.random.key(seed), "lstm"), settings.split_half_epochs
+    checkpoints = folder / "checkpoints" / "lstm-halves"
+    return behaviour_cloning.fit(
+        start, first, second, behaviour_cloning.Settings(epochs=halves), checkpoints=checkpoints
+    )
 
 
 def _prediction(params: navigator.Params, segments: Sequence[Walk]) -> dict[str, np.ndarray]:

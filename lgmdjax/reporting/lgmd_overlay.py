@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lgmdjax.detectors.lgmd import U_AT_REST, Layers
 from lgmdjax.errors import InputError
+from lgmdjax.sensors import hemifield
 
 FloatT = TypeVar("FloatT", float, ndarray)
 PANEL_TITLES = ("left eye | right eye, above T_s in orange", "E  excitation", "I  inhibition", "S  summation")
@@ -164,7 +165,7 @@ def _render_curves(layout: Layout, top: int, history: Sequence[ResponseSample]) 
     pen, font, now = ImageDraw.Draw(image), _font(13), history[-1]
     left, _, right, _ = layout.curve_box
     pen.text((left, 0), f"{now.time:.2f} s", fill=TEXT_COLOUR, font=font)
-    for side, (name, colour) in enumerate(zip(("left", "right"), EYE_COLOURS, strict=True)):
+    for side, (name, colour) in enumerate(zip(hemifield.SIDES, EYE_COLOURS, strict=True)):
         text = f"{name} eye: u {now.u[side]:.2f}, FF {now.feed_forward[side]:.1f}"
         pen.text((left + 80 + 180 * side, 0), text, fill=colour, font=font)
     u = np.array([sample.u for sample in history[-HISTORY_FRAMES:]])

@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 import av
 import numpy as np
-from av.container import InputContainer
+from av.container import InputContainer, OutputContainer
 from av.error import FFmpegError, InvalidDataError
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 from av.video.stream import VideoStream
@@ -107,29 +107,41 @@ def open_writer(
         # FFmpeg would take some names for the address of a protocol.
         file = stack.enter_context(target.open("wb")) if isinstance(target, Path) else target
         container = stack.enter_context(av.open(file, "w", format="mp4"))
-        stream = container.add_stream("h264", rate=Fraction(rate).limit_denominator(90_000))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": "20", "preset": "ultrafast" if fast else "veryfast"}
-        if fast:
-            stream.thread_count = 1  # its own; more would wait for each other
+        stream = _add_stream(container, width, height, rate, fast=fast)
         encoder = stack.enter_context(ThreadPoolExecutor(1))
         queue: deque[Future[None]] = deque()
 
-        def encode(picture: UInt8[np.ndarray, "height width channels"] | None) -> None:
-            channels = 0 if picture is None else picture.shape[-1]
-            pixels = "rgba" if channels == 4 else "rgb24"
-            frame = None if picture is None else av.VideoFrame.from_ndarray(picture, format=pixels)
-            container.mux(stream.encode(frame))
-
         def write(picture: UInt8[np.ndarray, "height width channels"]) -> None:
-            queue.append(encoder.submit(encode, picture))
+            queue.append(encoder.submit(_encode, container, stream, picture))
             if len(queue) > MAX_QUEUED_PICTURES:
                 queue.popleft().result()  # raises what the thread did
 
         yield write
-        queue.append(encoder.submit(encode, None))
+        queue.append(encoder.submit(_encode, container, stream, None))
         for encoded in queue:
             encoded.result()
+
+
+def _add_stream(
+    container: OutputContainer, width: int, height: int, rate: Fraction | int, *, fast: bool
+) -> VideoStream:
+    """Add an H.264 stream to a file, and return it."""
+    stream = container.add_stream("h264", rate=Fraction(rate).limit_denominator(90_000))
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    stream.options = {"crf": "20", "preset": "ultrafast" if fast else "veryfast"}
+    if fast:
+        stream.thread_count = 1  # its own; more would wait for each other
+    return stream
+
+
+def _encode(
+    container: OutputContainer, stream: VideoStream, picture: UInt8[np.ndarray, "height width channels"] | None
+) -> None:
+    """Write a picture to the stream; None writes what the encoder still holds."""
+    frame = None
+    if picture is not None:
+        frame = av.VideoFrame.from_ndarray(picture, format="rgba" if picture.shape[-1] == 4 else "rgb24")
+    container.mux(stream.encode(frame))
 
 
 def _begin(packets: Iterator[av.Packet]) -> tuple[list[av.VideoFrame], int]:

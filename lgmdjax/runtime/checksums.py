@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 STAMP = "done.json"
 SEAL = "sha256"  # name of a document's own checksum
-PARTIAL = (".partial", ".part")  # suffixes of files that were not finished; version 0.1.0 wrote .part
+PARTIAL = ".partial"  # in the names of unfinished files and folders
+UNFINISHED = (PARTIAL, ".part")  # suffixes of unfinished files; version 0.1.0 wrote .part
 MAX_DEPTH = 3  # folders from a file up to the one whose done.json lists it
 
 
@@ -62,7 +63,7 @@ def require_seal(content: object) -> None:
 
 def list_files(folder: Path) -> dict[str, str]:
     """Return the checksums of all results in a folder and below, by name; left-overs of killed processes are none."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix not in PARTIAL)
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix not in UNFINISHED)
     return {path.relative_to(folder).as_posix(): digest(path.read_bytes()) for path in files if path.name != STAMP}
 
 

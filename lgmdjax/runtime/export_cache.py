@@ -28,7 +28,6 @@ around it, JAX's own cache, holds machine code: whoever may write to that one ru
 """
 
 import functools
-import hashlib
 import inspect
 import json
 import os
@@ -48,8 +47,9 @@ from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, PyTree
 
+from lgmdjax.errors import one_line
 from lgmdjax.paths import PACKAGE_DIR
-from lgmdjax.runtime import pytree_json, storage
+from lgmdjax.runtime import checksums, partial_files, pytree_json
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -57,7 +57,7 @@ R = TypeVar("R")
 CACHE_OPTION = "jax_compilation_cache_dir"
 FORMAT, VERSION = "lgmdjax traced program", 2
 RESULT_PACKAGES = frozenset({"lgmdjax", "mujoco", "optax", "flax"})  # whose classes may be part of results
-OWN_FILES = re.compile(r".+-[0-9a-f]{32}-(?P<release>[0-9a-f]{16})\.program(\.\d+\.partial)?")
+OWN_FILES = re.compile(rf".+-[0-9a-f]{{32}}-(?P<release>[0-9a-f]{{16}})\.program(\.\d+{re.escape(checksums.PARTIAL)})?")
 ALLOWED_CALLS = (
     r"@(?:(?:lapack|blas|cublas|cusolver|hipblas|hipsolver)_\w+|(?:cu|hip)_threefry2x32\w*"
     r"|Sharding|SPMDFullToShardShape|SPMDShardToFullShape)\("
@@ -126,11 +126,9 @@ def cached_jit(function: Any = None, *, donate_argnames: tuple[str, ...] = ()) -
 
 def hash_folder(folder: Path) -> str:
     """Return a hash of the names and contents of all files in a folder and below."""
-    total = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            total.update(f"{path.relative_to(folder)}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and "__pycache__" not in path.parts)
+    lines = (f"{path.relative_to(folder)} {checksums.digest(path.read_bytes())}\n" for path in files)
+    return checksums.digest(*(line.encode() for line in lines))
 
 
 PACKAGE_DIGEST = hash_folder(PACKAGE_DIR)
@@ -144,7 +142,7 @@ def _library_versions() -> tuple[str, ...]:
 
 def _release() -> str:
     """Return a hash of the versions that every program depends on."""
-    return hashlib.sha256(repr((PACKAGE_DIGEST, *_library_versions())).encode()).hexdigest()[:16]
+    return checksums.digest(repr((PACKAGE_DIGEST, *_library_versions())).encode())[:16]
 
 
 def _program_key(function: Callable[..., object], types: PyTree[str], static: Mapping[str, object]) -> str:
@@ -157,7 +155,7 @@ def _program_key(function: Callable[..., object], types: PyTree[str], static: Ma
     everything = name, types, sorted(static.items()), _release(), settings, devices
     # As text: pickle gives other bytes for equal values if parts of them are one object.
     with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
-        return hashlib.sha256(repr(everything).encode()).hexdigest()[:32]
+        return checksums.digest(repr(everything).encode())[:32]
 
 
 def _cache_folder() -> Path | None:
@@ -219,9 +217,9 @@ def _trace(
 
 def _write(file: Path, content: bytes) -> None:
     """Write a program with its checksum, and delete those of other releases."""
-    with storage.replacing(file) as partial:
+    with partial_files.replacing(file) as partial:
         partial.touch(mode=0o600)
-        partial.write_bytes(hashlib.sha256(content).hexdigest().encode() + b"\n" + content)
+        partial.write_bytes(checksums.digest(content).encode() + b"\n" + content)
     for other in file.parent.iterdir():
         name = OWN_FILES.fullmatch(other.name)
         if name and name["release"] != _release():
@@ -238,7 +236,7 @@ def _read(file: Path, key: str, packages: frozenset[str]) -> Callable[..., PyTre
     except FileNotFoundError:
         return None
     except Exception as error:  # whatever a damaged or hostile file makes JSON, JAX or MLIR raise
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)[:200]
         warnings.warn(f"{file} cannot be read ({reason}); it is deleted and made again", stacklevel=4)
         file.unlink(missing_ok=True)
         return None
@@ -247,7 +245,7 @@ def _read(file: Path, key: str, packages: frozenset[str]) -> Callable[..., PyTre
 def _parse(content: bytes, key: str, packages: frozenset[str]) -> tuple[export.Exported, PyTree]:
     """Return the program in a file and a tree of the structure of its results; raise an exception if it is damaged."""
     checksum, _, rest = content.partition(b"\n")
-    if checksum != hashlib.sha256(rest).hexdigest().encode():
+    if checksum != checksums.digest(rest).encode():
         raise ValueError("its checksum is wrong")
     text, _, program = rest.partition(b"\n")
     header = json.loads(text)

@@ -24,7 +24,7 @@ def replacing(path: Path) -> Iterator[Path]:
     A block that raises leaves `path` as it was, and no temporary file. A process that is killed leaves a temporary
     file, `<name>.<process>.partial` (`remove_partial_files`).
     """
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f"{path.name}.{os.getpid()}{checksums.PARTIAL}")
     try:
         yield partial
         sync(partial)
@@ -91,7 +91,7 @@ def _working_folder(parent: Path, *, remove_empty: bool = False) -> Iterator[Pat
     try:
         parent.mkdir(parents=True, exist_ok=True)
         _remove_abandoned_folders(parent)
-        work = parent / f".partial-{secrets.token_hex(8)}"
+        work = parent / f"{checksums.PARTIAL}-{secrets.token_hex(8)}"
         lock = FileLock(_lock_of(work)).acquire()  # before there is a folder, so that one without a lock is abandoned
     except OSError as error:
         raise not_writable(parent, error) from error
@@ -112,7 +112,7 @@ def remove_partial_files(folder: Path) -> None:
 
     Only the process that holds the lock of the folder may call this.
     """
-    for suffix in checksums.PARTIAL:
+    for suffix in checksums.UNFINISHED:
         for abandoned in folder.rglob(f"*{suffix}"):
             if abandoned.is_file():
                 abandoned.unlink(missing_ok=True)
@@ -138,7 +138,7 @@ def _lock_of(folder: Path) -> Path:
 
 def _remove_abandoned_folders(folder: Path) -> None:
     """Remove the temporary folders of killed processes, whose locks the operating system released."""
-    for work in [*folder.glob(".partial-*")]:
+    for work in [*folder.glob(f"{checksums.PARTIAL}-*")]:
         lock = work if work.suffix == ".lock" else _lock_of(work)
         with contextlib.suppress(OSError), FileLock(lock).acquire(blocking=False):
             shutil.rmtree(lock.with_suffix(""), ignore_errors=True)

@@ -18,7 +18,6 @@ resumed.
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import os
 import shutil
@@ -113,7 +112,7 @@ def execute(run: Run, stages: Sequence[Stage], target: str) -> Path:
     required = _required_stages({stage.name: stage for stage in stages}, target)
     fingerprints: dict[str, str] = {}
     with _locked(run):
-        for abandoned in run.folder.glob("*.partial"):
+        for abandoned in run.folder.glob(f"*{checksums.PARTIAL}"):
             abandoned.unlink(missing_ok=True)
         for stage in stages:
             if stage.name in required:
@@ -134,7 +133,7 @@ def fingerprint(stage: Stage, settings: object, seed: int, inputs: Mapping[str, 
         "seed": seed,
         "inputs": {name: inputs[name] for name in stage.inputs},
     }
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+    return checksums.digest(json.dumps(facts, sort_keys=True).encode())[:16]
 
 
 def describe_devices() -> str:
@@ -153,11 +152,11 @@ def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
         return
     if fault:
         print(f"{stage.name}: done again, because {fault}", flush=True)
-    partial = run.folder / f"{stage.name}.partial-{stage_fingerprint}"
+    partial = run.folder / f"{stage.name}{checksums.PARTIAL}-{stage_fingerprint}"
     _adopt_stamp(partial)
     if _find_fault(partial, stage_fingerprint) is not None:  # None if the process was killed before the move below
         (partial / checksums.STAMP).unlink(missing_ok=True)
-        for outdated in set(run.folder.glob(f"{stage.name}.partial-*")) - {partial}:
+        for outdated in set(run.folder.glob(f"{stage.name}{checksums.PARTIAL}-*")) - {partial}:
             shutil.rmtree(outdated)
         _print_start(stage, final, run.seed, resumed=partial.exists())
         seconds = _run_in(partial, run, stage, stage_fingerprint)
@@ -170,7 +169,7 @@ def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
 
 def _adopt_stamp(folder: Path) -> None:
     """Give a done.json its name that a process wrote to its end, but was killed before it could name it."""
-    for written in folder.glob(f"{checksums.STAMP}.*.partial"):
+    for written in folder.glob(f"{checksums.STAMP}.*{checksums.PARTIAL}"):
         with contextlib.suppress(OSError, ValueError, RecursionError):
             if checksums.is_sealed(json.loads(written.read_bytes())):
                 os.replace(written, folder / checksums.STAMP)

@@ -5,8 +5,7 @@
 | JSON                     | `write_json`, `write_stamp`      | `read_json`, `read_table`   |
 | npz                      | `write_arrays`                   | `read_arrays`               |
 | safetensors              | `save_tensors`                   | `load_tensors`              |
-| any other                | `replacing`, `replacing_all`     | the module that knows it    |
-| a new folder             | `new_folder`                     | the user                    |
+| any other                | `lgmdjax.runtime.partial_files`  | `read_file`                 |
 
 What is read is compared with its checksum, where it has one (`lgmdjax.runtime.checksums`). A file is written under a
 temporary name first (`lgmdjax.runtime.partial_files`).
@@ -29,13 +28,7 @@ from safetensors.numpy import save as serialise
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.paths import PACKAGE_DIR
 from lgmdjax.runtime import checksums, schema
-from lgmdjax.runtime.partial_files import new_folder as new_folder
-from lgmdjax.runtime.partial_files import not_writable as not_writable
-from lgmdjax.runtime.partial_files import remove_partial_files as remove_partial_files
-from lgmdjax.runtime.partial_files import replacing as replacing
-from lgmdjax.runtime.partial_files import replacing_all as replacing_all
-from lgmdjax.runtime.partial_files import require_empty as require_empty
-from lgmdjax.runtime.partial_files import sync as sync
+from lgmdjax.runtime.partial_files import replacing, sync
 
 JsonObject = dict[str, Any]
 """A JSON object: a row of a study, a file's header."""
@@ -63,6 +56,12 @@ def write_stamp(folder: Path, facts: JsonObject) -> None:
         sync(path)
     sync(folder)
     write_json(folder / checksums.STAMP, checksums.seal({**facts, "files": checksums.list_files(folder)}))
+
+
+def read_file(path: Path) -> bytes:
+    """Read any other file of a run folder; raise `InputError` for a missing or damaged one."""
+    with _naming_command(path):
+        return checksums.read_bytes(path)
 
 
 def read_json(path: Path) -> Any:
@@ -120,8 +119,8 @@ def _require_sizes(content: bytes) -> None:
                 }[np.lib.format.read_magic(file)]
                 shape, _, dtype = read_header(file)
                 stated = math.prod(shape) * dtype.itemsize
-                is_honest = file.tell() + stated == member.file_size <= len(content)
-                if min(shape, default=0) < 0 or not is_honest:
+                has_that_size = file.tell() + stated == member.file_size <= len(content)
+                if min(shape, default=0) < 0 or not has_that_size:
                     raise ValueError(f"{member.filename} says that it has {stated} bytes")
 
 

@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lgmdjax.errors import InputError
 from lgmdjax.sensors import antialiasing, compositing, hemifield, silhouettes
 from lgmdjax.sensors.fusion import materialise
+from lgmdjax.sensors.settings import check_field
 from lgmdjax.world.arena import Arena
 from lgmdjax.world.texture import WAVES
 
@@ -80,7 +81,7 @@ class Params:
             )
         if self.bands > len(WAVES):
             raise InputError(f"expected at most {len(WAVES)} texture bands, got {self.bands}; lower camera bands")
-        hemifield.check(self.overlap, self.ground)
+        check_field(overlap=self.overlap, ground=self.ground)
         if not 0.0 < self.fov * math.hypot(1.0, self.height / self.width) < 2.0 * math.pi:
             raise InputError(
                 f"expected a camera fov above 0 with corners less than pi rad from the middle, got {self.fov!r} rad "

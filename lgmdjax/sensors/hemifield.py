@@ -7,8 +7,10 @@ import numpy as np
 from jaxtyping import Array, Shaped
 
 from lgmdjax.errors import InputError
+from lgmdjax.sensors.settings import check_field
 
 LEFT, RIGHT = 0, 1
+SIDES = ("left", "right")  # their names
 
 
 def column_count(width: int, overlap: float) -> int:
@@ -44,7 +46,7 @@ def crop(image: Array | np.ndarray, side: int, *, overlap: float, ground: float 
         overlap: fraction of the width to keep; 0.5 is no overlap, 1 the whole image.
         ground: fraction of the height, at the bottom, that is left out.
     """
-    check(overlap, ground)
+    check_field(overlap=overlap, ground=ground)
     if side not in (LEFT, RIGHT):
         raise InputError(f"lgmd side: expected 0 (left) or 1 (right), got {side}; see hemifield.LEFT, hemifield.RIGHT")
     height, width = jnp.shape(image)[-2:]
@@ -65,13 +67,3 @@ def edges(fov: float, overlap: float) -> tuple[float, float]:
 def outermost_first(frames: Shaped[Array, "2 height columns"]) -> Shaped[Array, "2 height columns"]:
     """Mirror the picture of the right eye: in both pictures the first column is then that of the largest bearing."""
     return jnp.stack([frames[LEFT], frames[RIGHT, :, ::-1]])
-
-
-def check(overlap: float, ground: float) -> None:
-    """Raise `InputError` for a hemifield that is not possible."""
-    if not 0.5 <= overlap <= 1:
-        raise InputError(f"lgmd overlap: expected a fraction of the width in 0.5..1, got {overlap}; 0.5 is no overlap")
-    if not 0 <= ground < 1:
-        raise InputError(
-            f"lgmd ground: expected a fraction of the height from 0 to less than 1, got {ground}; 0 leaves nothing out"
-        )

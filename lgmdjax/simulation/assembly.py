@@ -1,6 +1,6 @@
 """Robots assembled from the files of a run, or from those of the package."""
 
-import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -15,14 +15,13 @@ from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.locomotion import shaping
 from lgmdjax.paths import PRETRAINED_DIR
-from lgmdjax.runtime import schema
+from lgmdjax.runtime import checksums, schema
 from lgmdjax.runtime.storage import JsonObject, read_arrays, read_json
 from lgmdjax.sensors import camera, hemifield
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.sensors.settings import FIELD_LIMITS, CameraSettings, Resolution
 from lgmdjax.simulation import closed_loop
 
 REPLAY_LENGTH = 4096  # velocities of policy random; static, so that one compiled program serves all stages
-CALIBRATED = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I
 LGMD = schema.Object(
     {
         "threshold": schema.Number(0, 255),  # grey
@@ -31,7 +30,7 @@ LGMD = schema.Object(
     }
 )
 SIDE = schema.Integer(1, camera.MAX_SIZE)  # px
-FIELD = {"overlap": schema.Number(0.5, 1), "ground": schema.Number(0, 0.99), "falloff": schema.Number(0, 100)}
+FIELD = {name: schema.Number(*limits) for name, limits in FIELD_LIMITS.items()}
 EYES = schema.Object({"width": SIDE, "height": SIDE}, {**FIELD, "pooling": SIDE})
 HEADER = schema.Object({"eyes": EYES, "lgmd": LGMD})
 """What the header of a controller holds besides the network's structure."""
@@ -51,6 +50,13 @@ def camera_settings(robot: closed_loop.Params) -> CameraSettings:
     """Return the settings that `with_camera` gave a robot."""
     of_camera = {name: getattr(robot.camera, name) for name in ("width", "height", "overlap", "ground")}
     return CameraSettings(**of_camera, pooling=robot.controller.lgmd.pooling, falloff=robot.controller.lgmd.falloff)
+
+
+def read_camera_settings(header: Mapping[str, JsonObject]) -> CameraSettings:
+    """Return the camera of a controller's training, or of recorded walks, from their header."""
+    eyes = header["eyes"]
+    schema.check(EYES, eyes, "header: eyes", "collect and train again")
+    return CameraSettings(**{name: eyes[name] for name in (*EYES.fields, *EYES.optional) if name in eyes})
 
 
 def fit_detector(detector: lgmd.Params, settings: CameraSettings) -> lgmd.Params:
@@ -80,8 +86,7 @@ def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAIN
     switch = make_policies(navigator_params, float(arrays["gain"]), arrays["replayed"])
     smallest = min(header["eyes"]["width"], header["eyes"]["height"])
     schema.check(schema.Integer(1, smallest), header["eyes"].get("pooling", 1), f"{controller}: pooling", "train again")
-    eyes = {name: header["eyes"][name] for name in (*EYES.fields, *EYES.optional) if name in header["eyes"]}
-    return assemble_robot(gait_folder, CameraSettings(**eyes), _lgmd_params(header["lgmd"]), switch)
+    return assemble_robot(gait_folder, read_camera_settings(header), _lgmd_params(header["lgmd"]), switch)
 
 
 def assemble_robot(
@@ -139,8 +144,14 @@ def with_camera(params: closed_loop.Params, settings: CameraSettings) -> closed_
     return replace(params, camera=camera_params(settings), controller=replace(params.controller, lgmd=lgmd_params))
 
 
-def scale_camera(robot: closed_loop.Params, width: int) -> CameraSettings:
-    """Return camera settings with pictures of another width and LGMD cells of the same size in degrees.
+def with_resolution(robot: closed_loop.Params, resolution: Resolution) -> closed_loop.Params:
+    """Return the robot with images and LGMD cells of another size; what its LGMDs see stays as it was trained."""
+    sizes = {name: getattr(resolution, name) for name in ("width", "height", "pooling")}
+    return with_camera(robot, replace(camera_settings(robot), **sizes))
+
+
+def scale_resolution(robot: closed_loop.Params, width: int) -> Resolution:
+    """Return the resolution with images of another width and LGMD cells of the same size in degrees.
 
     Raises InputError for a width at which the cells are not whole pixels.
     """
@@ -151,7 +162,7 @@ def scale_camera(robot: closed_loop.Params, width: int) -> CameraSettings:
             f"try {2 * camera.width}"
         )
     height, cell = camera.height * width // camera.width, pooling * width // camera.width
-    return replace(camera_settings(robot), width=width, height=height, pooling=cell)
+    return Resolution(width=width, height=height, pooling=cell)
 
 
 def with_policy(params: closed_loop.Params, name: PolicyName, policy_params: PyTree) -> closed_loop.Params:
@@ -184,7 +195,7 @@ def fingerprint(params: closed_loop.Params) -> str:
     """Return a hash of all parameters of a robot and their structure."""
     leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)]
     structure = repr((params.camera, jax.tree.structure(params))).encode()
-    return hashlib.sha256(b"".join(leaves) + structure).hexdigest()[:16]
+    return checksums.digest(*leaves, structure)[:16]
 
 
 def load_detector(folder: Path) -> lgmd.Params:
@@ -196,5 +207,5 @@ def load_detector(folder: Path) -> lgmd.Params:
 
 
 def _lgmd_params(constants: JsonObject) -> lgmd.Params:
-    threshold, suppression, inhibition = (float(constants[name]) for name in CALIBRATED)
+    threshold, suppression, inhibition = (float(constants[name]) for name in lgmd.SCALARS)
     return lgmd.Params(threshold=threshold, suppression=suppression, inhibition=inhibition)

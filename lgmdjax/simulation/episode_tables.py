@@ -11,10 +11,10 @@ import pyarrow as pa
 from lgmdjax.errors import InputError
 from lgmdjax.runtime import checksums, schema
 from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.sensors import hemifield
 from lgmdjax.simulation import finite
 from lgmdjax.simulation.closed_loop import Record
 
-SIDES = ("left", "right")
 MAX_ROWS = 10_000_000  # of a chunk: four hours of 23 robots
 MAX_NUMBER = 1e6  # in any unit: far beyond what a robot measures
 
@@ -38,13 +38,13 @@ FIELDS: Mapping[str, Field] = {
     "position": Field(("x", "y", "z"), "m"),
     "quaternion": Field(("qw", "qx", "qy", "qz"), "1"),
     "joints": Field(tuple(f"joint_{j}" for j in range(18)), "rad"),
-    "u": Field(tuple(f"u_{side}" for side in SIDES), "1"),
-    "feed_forward": Field(tuple(f"feed_forward_{side}" for side in SIDES), "grey"),
-    "excitation": Field(tuple(f"excitation_{side}" for side in SIDES), "grey"),
-    "distances": Field(tuple(f"distance_{side}" for side in SIDES), "m"),
-    "corridor": Field(tuple(f"corridor_{side}" for side in SIDES), "m"),
-    "label": Field(tuple(f"label_{side}" for side in SIDES), "0.05 m/s"),
-    "velocity": Field(tuple(f"velocity_{side}" for side in SIDES), "0.05 m/s"),
+    "u": Field(tuple(f"u_{side}" for side in hemifield.SIDES), "1"),
+    "feed_forward": Field(tuple(f"feed_forward_{side}" for side in hemifield.SIDES), "grey"),
+    "excitation": Field(tuple(f"excitation_{side}" for side in hemifield.SIDES), "grey"),
+    "distances": Field(tuple(f"distance_{side}" for side in hemifield.SIDES), "m"),
+    "corridor": Field(tuple(f"corridor_{side}" for side in hemifield.SIDES), "m"),
+    "label": Field(tuple(f"label_{side}" for side in hemifield.SIDES), "0.05 m/s"),
+    "velocity": Field(tuple(f"velocity_{side}" for side in hemifield.SIDES), "0.05 m/s"),
     "clearance": Field(("clearance",), "m"),
     "contact": Field(("contact",), kind="b"),
     "is_first": Field(("is_first",), kind="b"),

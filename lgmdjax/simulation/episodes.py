@@ -42,11 +42,12 @@ from flax import struct
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import checksums, partial_files, schema, versions
 from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.sensors import hemifield
 from lgmdjax.simulation import episode_tables, finite
 from lgmdjax.simulation.closed_loop import Record
 from lgmdjax.simulation.episode_tables import COLUMNS as COLUMNS
 from lgmdjax.simulation.episode_tables import FIELDS as FIELDS
-from lgmdjax.simulation.episode_tables import ORIGIN, SIDES
+from lgmdjax.simulation.episode_tables import ORIGIN
 
 FORMAT, VERSION = "lgmdjax episodes", 3
 RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, 2: {}, VERSION: {}}
@@ -276,7 +277,7 @@ def _with_present_columns(table: pa.Table, version: int, path: Path) -> pa.Table
     """Return the columns of a chunk of some version, under their present names."""
     table = table.rename_columns([RENAMED[version].get(name, name) for name in table.column_names])
     if version in NEAREST_ONLY:
-        for side in SIDES:
+        for side in hemifield.SIDES:
             if f"distance_{side}" in table.column_names:
                 table = table.append_column(f"corridor_{side}", table[f"distance_{side}"])
     return episode_tables.check(table, path)

@@ -54,6 +54,7 @@ from tqdm import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import controller, policies
+from lgmdjax.detectors import lgmd
 from lgmdjax.evaluation import metrics
 from lgmdjax.learning import dagger, finetuning, rollout_gradient
 from lgmdjax.learning.checkpoints import Checkpoints
@@ -95,7 +96,7 @@ COLOURS = {
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: FinetuneSettings, seed: int) -> None:
     """Train all learners with every random seed, and score them in the benchmark rooms."""
-    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
+    robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     rows = []
     for repeat in range(settings.seeds):
         repeat_folder = folder / f"repeat-{repeat}"
@@ -187,7 +188,7 @@ def _rooms(seed: int, robots: int, number: int) -> Room:
 
 def with_finetuned_params(robot: Params, finetuned: controller.Params) -> Params:
     """Return a robot with all five policies and the finetuned parameters; its thresholds stay hard or smooth."""
-    constants = {name: getattr(finetuned.lgmd, name) for name in ("threshold", "suppression", "inhibition", "kernel")}
+    constants = {name: getattr(finetuned.lgmd, name) for name in (*lgmd.SCALARS, "kernel")}
     detector = replace(robot.controller.lgmd, **constants)
     own = replace(robot.controller, lgmd=detector, cpg=finetuned.cpg, shaping=finetuned.shaping)
     return assembly.with_policy(replace(robot, controller=own), "learned", finetuned.policy)
@@ -195,7 +196,7 @@ def with_finetuned_params(robot: Params, finetuned: controller.Params) -> Params
 
 def detector_constants(learner: Params) -> dict[str, float]:
     """Return the detector's constants that a joint fit trains."""
-    return {name: float(getattr(learner.controller.lgmd, name)) for name in ("threshold", "suppression", "inhibition")}
+    return {name: float(getattr(learner.controller.lgmd, name)) for name in lgmd.SCALARS}
 
 
 def summarise(record: Record) -> JsonObject:

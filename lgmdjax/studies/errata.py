@@ -44,7 +44,7 @@ Change = Callable[[closed_loop.Params, Path], closed_loop.Params]  # (robot, fol
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: ErrataSettings, seed: int) -> None:
     """Measure the robot with every printed equation."""
-    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
+    robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     literal = folder / "literal.safetensors"
     if not literal.exists():  # a second fit might differ in the last bits, and the recorded walks would not match
         geometry = kinematics.read_geometry(hexapod.load())
@@ -89,10 +89,9 @@ def _with_printed_shaping(robot: closed_loop.Params, folder: Path) -> closed_loo
     return replace(robot, controller=replace(robot.controller, shaping=networks))
 
 
-def _with_whole_pictures(robot: closed_loop.Params, _: Path) -> closed_loop.Params:
-    """Give each detector the whole picture of its camera."""
-    whole = replace(assembly.camera_settings(robot), overlap=1.0, ground=0.0, falloff=0.0)
-    return assembly.with_camera(robot, whole)
+def _with_field(robot: closed_loop.Params, **changes: float) -> closed_loop.Params:
+    """Change what the detectors see of their pictures."""
+    return assembly.with_camera(robot, replace(assembly.camera_settings(robot), **changes))
 
 
 CASES: Mapping[str, Change] = {
@@ -100,7 +99,9 @@ CASES: Mapping[str, Change] = {
     "eqs. 1, 3: sign of w_fe": lambda robot, _: _with_cpg(robot, printed_sign=True),
     "eqs. 1, 3: coupling W": lambda robot, _: _with_cpg(robot, coupling=cpg.coupling(within_tripod=0.40, across=0.04)),
     "sec. 3.2: one input a leg": _with_printed_shaping,
-    "sec. 3.3: whole pictures": _with_whole_pictures,
+    "sec. 3.3: whole width": lambda robot, _: _with_field(robot, overlap=1.0),
+    "sec. 3.3: with the ground": lambda robot, _: _with_field(robot, ground=0.0),
+    "sec. 3.3: equal weights": lambda robot, _: _with_field(robot, falloff=0.0),
     "eq. 15: signed sum": lambda robot, _: _with_lgmd(robot, printed_feed_forward=True),
     "eq. 16: gate": lambda robot, _: _with_lgmd(robot, printed_gate=True),
     "eq. 22: rule alone": lambda robot, _: supervision.with_rule(robot, "eq. 22"),

@@ -52,7 +52,7 @@ CASES = (
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: FailureModesSettings, seed: int) -> None:
     """Record every case, and count the robots that touched nothing."""
-    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
+    robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     storage.write_json(folder / "failure_modes.json", [_measure(folder, robot, case, settings, seed) for case in CASES])
 
 

@@ -60,7 +60,7 @@ class Problem:
 def run(folder: Path, inputs: Mapping[str, Path], settings: GradientHorizonSettings, seed: int) -> None:
     """Take the gradient at every horizon in random rooms, with both contact models and in both precisions."""
     with jax.enable_x64(True):
-        robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.eyes)
+        robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.eyes)
         robot = rollout_gradient.smooth_thresholds(rollout_gradient.learned_only(robot))
         rooms, model = room_batches.training_rooms(seed, 0, settings.robots), hexapod.build()
         models = {"hard": model, "soft": hexapod.soften_contacts(model)}

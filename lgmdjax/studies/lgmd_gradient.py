@@ -88,7 +88,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: LgmdGradientSettings
     """Render recorded walks again, and fit by every method with every seed; fits that are on disk are kept."""
     recorded = dagger.read_all_walks(inputs)
     robot = assembly.load_robot(inputs["fit-gait"], inputs["train"])
-    teacher_camera = CameraSettings(**episodes.read_parameters(inputs["collect"] / "episodes")["eyes"])
+    teacher_camera = assembly.read_camera_settings(episodes.read_parameters(inputs["collect"] / "episodes"))
     rendered = rerender_segments(robot, sample_segments(recorded, settings, seed), teacher_camera)
     rows = []
     for repeat in range(settings.seeds):
@@ -207,7 +207,7 @@ def score(params: LgmdNavigator, walks: Sequence[Walk], differences: FrameDiffer
 def detector_constants(detector: lgmd.Params) -> JsonObject:
     """Return T_s, T_f, W_I and w_I as JSON values; w_I has the sum of eq. 9."""
     detector = lgmd_gradient_fit.normalise_kernel(detector)
-    return {name: float(getattr(detector, name)) for name in lgmd_gradient_fit.SCALARS} | {
+    return {name: float(getattr(detector, name)) for name in lgmd.SCALARS} | {
         "kernel": np.asarray(detector.kernel).tolist()
     }
 
@@ -275,7 +275,7 @@ def _plot_kernel(axes: Axes, detectors: Sequence[JsonObject], title: str) -> Non
         axes.text(column, row, f"{weight:.2f}", ha="center", va="center", fontsize=6.5, color=colour)
     T_s, T_f, W_I = (
         "–".join(dict.fromkeys(f"{end([detector[name] for detector in detectors]):.2g}" for end in (min, max)))
-        for name in lgmd_gradient_fit.SCALARS
+        for name in lgmd.SCALARS
     )
     axes.set_title(f"{title}\n$T_s$ {T_s}, $T_f$ {T_f}\n$W_I$ {W_I}", fontsize=7.5)
     axes.set_axis_off()

@@ -30,7 +30,6 @@ from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import camera
-from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, episodes, recording, room_batches
 from lgmdjax.simulation.closed_loop import Params, Record
 from lgmdjax.studies.settings import OverlapSettings
@@ -46,7 +45,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: OverlapSettings, see
         raise InputError("expected a run whose recorded walks can be rendered again, got none; name one with --run")
     header = episodes.read_parameters(inputs["collect"] / "episodes")
     detector = assembly.load_detector(inputs["collect"])
-    camera_settings = CameraSettings(**header["eyes"])
+    camera_settings = assembly.read_camera_settings(header)
     robot = assembly.assemble_robot(inputs["fit-gait"], camera_settings, detector, assembly.make_policies())
     recorded = _recorded(inputs["collect"] / "episodes", header["robots"], settings.robots)
     rows = []

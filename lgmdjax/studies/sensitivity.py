@@ -7,7 +7,9 @@ data is the parameter are learners trained, on parts of the walks that the run r
 | ---------- | ----------------------------------------------------------------------------------- |
 | T_s        | threshold of the detector                                                           |
 | T_f        | threshold of its feed-forward inhibition, as a multiple of the calibrated one        |
-| overlap    | share of the picture that each detector gets                                        |
+| overlap    | share of the picture's width that each detector gets                                |
+| ground     | share of the picture's height, at the bottom, that no detector gets                 |
+| falloff    | exponent of the weights of a detector's cells beside the way                        |
 | pixels     | width of a picture; cells keep their size in degrees                                |
 | cell       | side of a cell, in pixels of a benchmark picture                                    |
 | rate       | pictures per second                                                                 |
@@ -40,7 +42,7 @@ from lgmdjax.locomotion import cpg
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import compiled_code, storage
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.sensors.settings import Resolution
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording
 from lgmdjax.simulation.closed_loop import FRAME_RATE
 from lgmdjax.simulation.episodes import Walk
@@ -49,7 +51,11 @@ from lgmdjax.studies.settings import SensitivitySettings
 
 THRESHOLDS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # grey; the calibrated one is added
 SUPPRESSION_FACTORS = (0.1, 0.2, 0.4, 0.7, 1.0, 2.0)
-OVERLAPS = (0.5, 0.6, 0.7, 0.8, 1.0)
+FIELDS = {  # of the detectors
+    "overlap": (0.5, 0.6, 0.7, 0.8, 1.0),
+    "ground": (0.0, 0.25, 0.5, 0.6),
+    "falloff": (0.0, 1.0, 2.0, 3.0),
+}
 PICTURE_SIZES = ((54, 40, 2), (80, 60, 3), (160, 120, 6), (320, 240, 12))  # width, height, side of a cell [px]
 POOLINGS = (1, 2, 3, 4, 6)  # px, side of a cell
 FRAME_INTERVALS = (1, 2, 3, 4)  # frames from one picture to the next
@@ -64,6 +70,8 @@ PARAMETERS = {
     "T_s": "T_s [grey]",
     "T_f": "T_f, as a multiple of the calibrated",
     "overlap": "share of the picture for each detector",
+    "ground": "share of the picture, at the bottom, for none",
+    "falloff": "falloff of the weights to the side",
     "pixels": "width of a picture [px], same cells",
     "cell": "side of a cell [px of a benchmark picture]",
     "rate": "pictures per second",
@@ -85,16 +93,16 @@ class Variation(NamedTuple):
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: SensitivitySettings, seed: int) -> None:
     """Score the robot with every variation, and every learner."""
-    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
+    robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     recorded = dagger.read_all_walks(inputs)  # raises before hours of rollouts
     rows = []
-    for _, same in groupby(variations(robot, settings.benchmark.eyes), key=attrgetter("parameter")):
+    for _, same in groupby(variations(robot), key=attrgetter("parameter")):
         for changed in same:
             facts = {"parameter": changed.parameter, "value": changed.value}
             rows.append(_score(folder, changed.robot, settings.benchmark, seed, facts, contrast=changed.contrast))
         compiled_code.clear_caches_if_crowded()  # each camera has its own programs
     rows += _score_learners(folder, robot, recorded, settings, seed)
-    chosen = baseline(robot, settings.benchmark.eyes)
+    chosen = baseline(robot)
     rows = [row | {"is_baseline": row["value"] == chosen.get(row["parameter"])} for row in rows]
     storage.write_json(folder / "sensitivity.json", rows)
 
@@ -114,37 +122,41 @@ def _score_learners(
         compiled_code.clear_caches_if_crowded()  # each amount of data has its own programs
 
 
-def baseline(robot: closed_loop.Params, camera_settings: CameraSettings) -> dict[str, float]:
+def baseline(robot: closed_loop.Params) -> dict[str, float]:
     """Return the value that each parameter has in the unchanged robot."""
+    eyes = assembly.camera_settings(robot)
     threshold = round(float(robot.controller.lgmd.threshold), 6)  # undo the rounding to float32
     own = {
         "T_s": threshold,
-        "overlap": camera_settings.overlap,
-        "pixels": camera_settings.width,
-        "cell": camera_settings.pooling,
+        "overlap": eyes.overlap,
+        "ground": eyes.ground,
+        "falloff": eyes.falloff,
+        "pixels": eyes.width,
+        "cell": eyes.pooling,
         "rate": FRAME_RATE,
     }
     return own | dict.fromkeys(("T_f", "contrast", "sway"), 1.0)
 
 
-def variations(robot: closed_loop.Params, camera_settings: CameraSettings) -> Iterator[Variation]:
+def variations(robot: closed_loop.Params) -> Iterator[Variation]:
     """Yield the robot with every parameter changed that needs no training."""
-    detector = robot.controller.lgmd
+    detector, eyes = robot.controller.lgmd, assembly.camera_settings(robot)
 
     def with_lgmd(**constants: Array | float) -> closed_loop.Params:
         return replace(robot, controller=replace(robot.controller, lgmd=replace(detector, **constants)))
 
-    for threshold in sorted({*THRESHOLDS, baseline(robot, camera_settings)["T_s"]}):
+    for threshold in sorted({*THRESHOLDS, baseline(robot)["T_s"]}):
         yield Variation("T_s", threshold, with_lgmd(threshold=jnp.asarray(threshold, float)))
     for factor in SUPPRESSION_FACTORS:
         yield Variation("T_f", factor, with_lgmd(suppression=factor * detector.suppression))
-    for overlap in OVERLAPS:
-        yield Variation("overlap", overlap, assembly.with_camera(robot, replace(camera_settings, overlap=overlap)))
+    for name, values in FIELDS.items():
+        for value in values:
+            yield Variation(name, value, assembly.with_camera(robot, replace(eyes, **{name: value})))
     for width, height, pooling in PICTURE_SIZES:
-        other = replace(camera_settings, width=width, height=height, pooling=pooling)
-        yield Variation("pixels", width, assembly.with_camera(robot, other))
+        resolution = Resolution(width=width, height=height, pooling=pooling)
+        yield Variation("pixels", width, assembly.with_resolution(robot, resolution))
     for pooling in POOLINGS:
-        yield Variation("cell", pooling, assembly.with_camera(robot, replace(camera_settings, pooling=pooling)))
+        yield Variation("cell", pooling, assembly.with_camera(robot, replace(eyes, pooling=pooling)))
     for frames in FRAME_INTERVALS:
         yield Variation("rate", FRAME_RATE / frames, replace(robot, frame_stride=jnp.asarray(frames, jnp.int32)))
     for contrast in CONTRAST_FACTORS:

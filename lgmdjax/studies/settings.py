@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from lgmdjax.learning.settings import TrainSettings
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.learning.settings import DaggerSettings
+from lgmdjax.sensors.settings import Resolution
 from lgmdjax.simulation.settings import BenchmarkRooms
 
 
@@ -11,7 +11,7 @@ from lgmdjax.simulation.settings import BenchmarkRooms
 class VelocitySettings:
     """LGMD response against walking velocity; every robot covers the same distance at each velocity."""
 
-    eyes: CameraSettings  # the stereo camera
+    eyes: Resolution  # of the stereo camera
     robots: int  # number of robots, each in a room of its own
     distance: float  # distance that each robot walks at each velocity [m]
     velocities: tuple[float, ...] = (0.1, 0.25, 0.5, 0.75, 1.0, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0, 4.0, 5.0)
@@ -23,7 +23,7 @@ class SupervisionSettings:
     """Navigators trained by several teaching rules, and networks of several kinds."""
 
     benchmark: BenchmarkRooms  # rooms in which robots are compared
-    dagger: TrainSettings  # DAgger rounds of each learner
+    dagger: DaggerSettings  # DAgger rounds of each learner
     demonstration_seconds: float  # duration of each robot's demonstration [s]
     seeds: int  # number of random seeds for each case
 
@@ -78,7 +78,7 @@ class GaitGradientSettings:
 class GradientHorizonSettings:
     """Gradient of a closed-loop walk against the number of frames that it is taken through."""
 
-    eyes: CameraSettings  # the stereo camera
+    eyes: Resolution  # of the stereo camera
     robots: int  # number of robots, each in a room of its own
 
 
@@ -87,7 +87,7 @@ class FinetuneSettings:
     """The navigator finetuned in the closed loop, against DAgger for the same simulated time."""
 
     benchmark: BenchmarkRooms  # rooms in which robots are compared
-    dagger: TrainSettings  # DAgger rounds, each as long as one room of finetuning
+    dagger: DaggerSettings  # DAgger rounds, each as long as one room of finetuning
     demonstration_seconds: float  # duration of each robot's demonstration [s]
     window: int  # frames through which the gradient is taken
     horizons: tuple[int, ...]  # other windows [frames], tried with the first seed; each should divide a round evenly

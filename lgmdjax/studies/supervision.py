@@ -59,7 +59,7 @@ CASES = (
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: SupervisionSettings, seed: int) -> None:
     """Train every case with every random seed, and score all in the benchmark rooms."""
-    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
+    robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     rows = []
     for rule in RULES:
         ruled, facts = with_rule(robot, rule), {"rule": rule}

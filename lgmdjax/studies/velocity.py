@@ -68,7 +68,7 @@ class Row:
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: VelocitySettings, seed: int) -> None:
     """Record walks at every velocity in the same rooms, and compare the responses."""
-    robot = assembly.with_camera(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.eyes)
+    robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.eyes)
     measured = []
     for velocity in settings.velocities:
         seconds = max(settings.distance / (velocity * float(tripod_gait.Gait().nominal_velocity)), MIN_SECONDS)

@@ -49,7 +49,7 @@ def test_a_variable_that_a_library_does_not_understand_is_named(
 def test_an_impossible_number_of_devices_is_named(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", value)
     with pytest.raises(InputError, match=f"expected JAX_NUM_CPU_DEVICES of 1 to 1024, got '{value}'"):
-        environment.start_jax()
+        environment.check_jax()
 
 
 def test_a_limit_of_memory_in_which_xla_would_end_the_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,7 +57,7 @@ def test_a_limit_of_memory_in_which_xla_would_end_the_process_is_named(monkeypat
         pytest.skip("there are no such limits")
     monkeypatch.setattr(jax_setup.resource, "getrlimit", lambda _: (10**9, -1))
     with pytest.raises(InputError, match="expected 2 GB of memory or more, got a limit of 1 GB"):
-        environment.start_jax()
+        environment.check_jax()
 
 
 def test_a_fault_of_the_program_is_no_fault_of_the_environment() -> None:

@@ -111,7 +111,6 @@ def test_other_settings_in_the_same_folder_are_one_line(
         (["--train.epochs", "-1"], "more than 0 for --train.epochs, got -1"),
         (["--train.epochs", "0"], "more than 0 for --train.epochs, got 0"),
         (["--collect.seconds", "inf"], "--collect.seconds, got inf"),
-        (["--collect.eyes.overlap", "nan"], "--collect.eyes.overlap, got nan"),
         (["--train.turn-gains", "1.5", "-2"], "--train.turn-gains, got -2"),
         (["--train.dagger-rounds", "-1"], "0 or more for --train.dagger-rounds"),
         (["--evaluate.unseen.trial", "tube"], "--evaluate.unseen.trial"),
@@ -126,6 +125,22 @@ def test_a_setting_that_makes_no_sense_is_one_line(
 ) -> None:
     assert words in refused(["train", "--scale", "smoke", "--out", str(tmp_path), *flags], capsys)
     assert not any(tmp_path.iterdir())
+
+
+def test_an_impossible_field_of_the_eyes_is_refused_before_anything_runs(
+    tmp_path: Path, executed: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, value, limits in (
+        ("overlap", "nan", "0.5 to 1"),
+        ("overlap", "0.2", "0.5 to 1"),
+        ("ground", "1.0", "0 to"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main.main(["train", "--scale", "smoke", "--out", str(tmp_path), f"--collect.eyes.{name}", value])
+        assert ended.value.code == 2
+        words = capsys.readouterr().err.replace("│", " ").split()
+        assert f"collect.eyes: expected a{'n' * (name == 'overlap')} {name} of the eyes of {limits}" in " ".join(words)
+    assert not executed and not any(tmp_path.iterdir())
 
 
 def test_a_setting_that_does_not_exist_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import os
 import signal
 import time
@@ -98,7 +99,27 @@ def test_responses_equal_those_of_the_detector(tmp_path: Path) -> None:
     metadata = {key.decode(): value.decode() for key, value in table.schema.metadata.items()}
     assert json.loads(metadata["lgmd"])["threshold"] == 3
     assert json.loads(metadata["units"])["time"] == "s"
-    assert json.loads(metadata["eyes"]) == {"stereo": False, "overlap": 0.75, "width": 320}
+    assert json.loads(metadata["eyes"]) == {
+        **{"stereo": False, "overlap": 0.75, "ground": 0.0, "width": 320},
+        **{"pooling": 1, "falloff": 0.0},
+    }
+
+
+def test_the_field_of_the_detectors_can_be_set(tmp_path: Path) -> None:
+    """u is that of `lgmd.step` for the upper rows, those of the right eye mirrored, with weights by bearing."""
+    path = save(tmp_path / "disc.mp4", looming(72))
+    flags = ("--ground", "0.25", "--falloff", "2", "--fov", "120", "--pooling", "3", "--threshold", "1")
+    table = run(path, *flags)
+    params = lgmd.Params(threshold=1.0, pooling=3, falloff=2.0, edges=(math.radians(60.0), 0.0))
+    with video_io.open_reader(path) as video:
+        frames = [jnp.asarray(frame.picture.astype(float)) for frame in video.frames(WIDTH, HEIGHT)]
+    rows, half = HEIGHT * 3 // 4, WIDTH // 2
+    for name, columns in (("left", slice(0, half)), ("right", slice(WIDTH, half - 1, -1))):
+        state, u = lgmd.init(params, frames[0][:rows, columns]), []
+        for frame in frames:
+            state, response = lgmd.step(params, state, frame[:rows, columns])
+            u.append(float(response.u))
+        assert np.allclose(column(table, f"u_{name}"), u, atol=1e-6)
 
 
 def test_stereo_gives_each_eye_its_own_picture(tmp_path: Path) -> None:

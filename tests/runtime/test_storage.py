@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from lgmdjax.errors import InputError
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import partial_files, storage
 
 KIND = storage.TensorFile(format="test weights", version="3", name="weights", remedy="`lgmdjax train` makes some")
 SHAPES = {"a": (2, 3), "b": (1,)}
@@ -27,7 +27,7 @@ def path(tmp_path: Path) -> Path:
 def test_a_file_is_replaced_at_the_end(tmp_path: Path) -> None:
     path = tmp_path / "file.txt"
     path.write_text("old")
-    with storage.replacing(path) as partial:
+    with partial_files.replacing(path) as partial:
         partial.write_text("new")
         assert path.read_text() == "old"
         assert partial.parent == tmp_path and str(os.getpid()) in partial.name
@@ -38,14 +38,14 @@ def test_a_file_is_replaced_at_the_end(tmp_path: Path) -> None:
 def test_a_file_stays_if_writing_fails(tmp_path: Path, error: type[BaseException]) -> None:
     path = tmp_path / "file.txt"
     path.write_text("old")
-    with pytest.raises(error), storage.replacing(path) as partial:
+    with pytest.raises(error), partial_files.replacing(path) as partial:
         partial.write_text("half")
         raise error
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_nothing_is_replaced_by_no_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), storage.replacing(tmp_path / "file.txt"):
+    with pytest.raises(FileNotFoundError), partial_files.replacing(tmp_path / "file.txt"):
         pass
     assert not list(tmp_path.iterdir())
 
@@ -55,32 +55,32 @@ def test_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("")
-    storage.remove_partial_files(tmp_path)
+    partial_files.remove_partial_files(tmp_path)
     left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert left == {"kept.json", str(Path("folder.partial/c.json"))}
 
 
 def test_several_files_are_replaced_at_the_end(tmp_path: Path) -> None:
     folder = tmp_path / "new"
-    with storage.replacing_all(folder) as partial:
+    with partial_files.replacing_all(folder) as partial:
         (partial / "a").write_text("a")
         (partial / "b").write_text("b")
         assert not (folder / "a").exists()
     assert sorted(path.name for path in folder.iterdir()) == ["a", "b"]
-    with pytest.raises(ValueError), storage.replacing_all(folder) as partial:
+    with pytest.raises(ValueError), partial_files.replacing_all(folder) as partial:
         (partial / "a").write_text("half")
         raise ValueError
     assert (folder / "a").read_text() == "a" and len(list(folder.iterdir())) == 2
 
 
 def test_a_folder_is_not_made_if_writing_fails(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), storage.replacing_all(tmp_path / "new"):
+    with pytest.raises(KeyboardInterrupt), partial_files.replacing_all(tmp_path / "new"):
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(InputError, match="expected a folder that can be written"),
-        storage.replacing_all(tmp_path / "file"),
+        partial_files.replacing_all(tmp_path / "file"),
     ):
         pass
 
@@ -236,18 +236,18 @@ def test_what_is_no_json_is_refused(tmp_path: Path, content: bytes) -> None:
 
 def test_folders_of_killed_processes_are_removed_but_not_those_of_living_ones(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys, time; from pathlib import Path; from lgmdjax.runtime import storage\n"
-        "with storage.replacing_all(Path(sys.argv[1])) as work:\n"
+        "import os, signal, sys, time; from pathlib import Path; from lgmdjax.runtime import partial_files\n"
+        "with partial_files.replacing_all(Path(sys.argv[1])) as work:\n"
         "    (work / 'half').write_text('half'); print(flush=True); time.sleep(60)\n"
     )
     start = [sys.executable, "-c", script, str(tmp_path)]
     with subprocess.Popen(start, stdout=subprocess.PIPE) as killed:
         assert killed.stdout is not None and killed.stdout.readline()
         (work,) = [path for path in tmp_path.glob(".partial-*") if path.is_dir()]
-        with storage.replacing_all(tmp_path) as own:
+        with partial_files.replacing_all(tmp_path) as own:
             (own / "a").write_text("a")
         assert (work / "half").exists(), "the process that writes it lives"
         killed.kill()
-    with storage.replacing_all(tmp_path) as own:
+    with partial_files.replacing_all(tmp_path) as own:
         (own / "b").write_text("b")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]

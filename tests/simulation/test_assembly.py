@@ -45,6 +45,27 @@ def test_with_camera_changes_camera_and_pooling(robot):
     assert other.controller.lgmd.threshold == robot.controller.lgmd.threshold
 
 
+def test_a_robot_keeps_its_field_at_every_resolution(robot):
+    """What its detectors see is what it was trained with, also where settings say nothing of it."""
+    trained = assembly.with_camera(robot, CameraSettings(width=80, height=60, overlap=0.7, ground=0.25, falloff=1.5))
+    finer = assembly.with_resolution(trained, CameraSettings(width=160, height=120, pooling=6, ground=0.0))
+    assert assembly.camera_settings(finer) == CameraSettings(
+        width=160, height=120, pooling=6, overlap=0.7, ground=0.25, falloff=1.5
+    )
+    assert finer.controller.lgmd.edges == trained.controller.lgmd.edges
+    scaled = assembly.with_resolution(robot, assembly.scale_resolution(robot, 160))
+    assert assembly.camera_settings(scaled).falloff == assembly.camera_settings(robot).falloff
+
+
+@pytest.mark.parametrize("field", [{"overlap": 0.2}, {"overlap": 1.1}, {"ground": 1.0}, {"falloff": float("nan")}])
+def test_an_impossible_field_is_refused_when_it_is_made(field):
+    (name,) = field
+    with pytest.raises(InputError, match=f"expected an? {name} of the eyes of .* got"):
+        CameraSettings(width=80, height=60, **field)
+    with pytest.raises(InputError, match=f"eyes.{name}: expected a finite number of"):
+        assembly.read_camera_settings({"eyes": {"width": 80, "height": 60} | field})
+
+
 def test_fingerprint_depends_on_every_number_and_on_the_camera(robot):
     same = assembly.load_robot()
     assert assembly.fingerprint(robot) == assembly.fingerprint(same)

@@ -153,6 +153,14 @@ def test_an_erratum_changes_one_thing(robot):
         changed = {path for path in before if not np.array_equal(before[path], after[path])}
         own = ("coupling", "full_turn", "tie_tolerance", "corridor", "base")  # of W, or of the rule
         assert changed and all(any(word in path for word in own) for path in changed)
+    eyes = assembly.camera_settings(robot)
+    for part, field in (
+        ("whole width", {"overlap": 1.0}),
+        ("with the ground", {"ground": 0.0}),
+        ("equal weights", {"falloff": 0.0}),
+    ):
+        other = errata.CASES[f"sec. 3.3: {part}"](robot, Path())
+        assert assembly.camera_settings(other) == replace(eyes, **field) != eyes
     assert errata.CASES["eq. 16: gate"](robot, Path()).controller.lgmd.printed_gate
     assert errata.CASES["eq. 15: signed sum"](robot, Path()).controller.lgmd.printed_feed_forward
     assert errata.CASES["eqs. 1, 3: sign of w_fe"](robot, Path()).controller.cpg.printed_sign
@@ -168,9 +176,9 @@ def test_with_wall_contrast_changes_the_walls_only():
 
 
 def test_every_parameter_of_sensitivity_has_the_baseline_once(robot):
-    baseline = sensitivity.baseline(robot, EYES)
+    baseline = sensitivity.baseline(robot)
     values: dict[str, list[float]] = {}
-    for parameter, value, changed, contrast in sensitivity.variations(robot, EYES):
+    for parameter, value, changed, contrast in sensitivity.variations(robot):
         values.setdefault(parameter, []).append(value)
         if value == baseline[parameter] and parameter not in ("rate", "sway"):  # None in the unchanged robot
             assert contrast == 1.0

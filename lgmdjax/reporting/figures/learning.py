@@ -9,6 +9,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy import ndarray
 
 from lgmdjax.reporting.figures.style import LEFT_COLOUR, PALETTE, RIGHT_COLOUR, WIDTH, styled
+from lgmdjax.sensors.hemifield import SIDES
 
 
 @styled
@@ -69,7 +70,7 @@ def plot_predictions(
         ("command of the learned policy", "v [0.05 m/s]"),
     )
     for axes, series, (title, unit) in zip(panels, (u, corridor, label, predicted), titles, strict=True):
-        for values, colour, side in zip(series.T, (LEFT_COLOUR, RIGHT_COLOUR), ("left", "right"), strict=True):
+        for values, colour, side in zip(series.T, (LEFT_COLOUR, RIGHT_COLOUR), SIDES, strict=True):
             oscillates = series is u
             axes.plot(time, values, color=colour, linewidth=1.0, alpha=0.35 if oscillates else 1.0, label=side)
             if oscillates:
