@@ -30,8 +30,8 @@ $(VENV)/.ready: $(VENV)/.locked pyproject.toml
 reproduce: setup
 	'$(VENV)/bin/lgmdjax' reproduce --scale $(SCALE) --seed $(SEED)
 
-# Contracts, gradients, images and symmetry are compiled as users compile them; all other tests with other flags, which
-# saves time. With ARGS, such as a file, all tests that it names run at once.
+# Contracts, gradients, images, detectors, the closed loop and the robot's behaviour are compiled as users compile them;
+# all other tests with other flags, which saves time. With ARGS, such as a file, all tests that it names run at once.
 test: setup
 ifdef ARGS
 	'$(VENV)/bin/python' -m pytest $(ARGS)

@@ -40,7 +40,7 @@ def measure(params: closed_loop.Params, robots: int) -> tuple[float, float]:
     model, rooms = hexapod.build(), room_batches.random_rooms(jax.random.key(0), robots, 0.25)
     states = rollout.reset_batch(params, model, rooms, policy=policies.TEACHER)
     fixed = {"policy": policies.TEACHER, "frames": FRAMES}
-    compiled = rollout.rollout_batch.lower(params, model, rooms, states, render=jnp.asarray(True), **fixed).compile()
+    compiled = rollout.rollout_batch.lower(params, model, rooms, states, jnp.asarray(True), **fixed).compile()
     analysis = compiled.memory_analysis()
     robots_per_device = robots / sharding.device_count(robots)
     # Not every device reports its memory.
@@ -48,7 +48,7 @@ def measure(params: closed_loop.Params, robots: int) -> tuple[float, float]:
     seconds = []
     for _ in range(REPEATS + 1):  # the first is left out
         began = time.perf_counter()
-        states, _ = jax.block_until_ready(compiled(params, model, rooms, states, render=jnp.asarray(True)))
+        states, _ = jax.block_until_ready(compiled(params, model, rooms, states, jnp.asarray(True)))
         seconds.append(time.perf_counter() - began)
     return robots * FRAMES / statistics.median(seconds[1:]), memory
 

@@ -15,14 +15,26 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that robots are sharded
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs its own tuning flags as errors
+# Of small programs too, which every process would compile again.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 DEFAULT_XLA = os.environ.get("LGMDJAX_TEST_DEFAULT_XLA") == "1"
 if not DEFAULT_XLA:
     # Most of the tests' time is compilation, which takes a third less with XLA's older code generator. Its programs
     # render images more slowly, but tests render few.
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
-# Tests that run with the default flags: these files, all tests of mirror symmetry, and the gradient of the closed loop
-# through the controller. Its gradients through body and eyes take longer to compile so than all of these.
-DEFAULT_XLA_FILES = ("test_contract.py", "test_gradients.py", "test_camera.py", "test_behaviour.py")
+# Tests that run with the default flags, as whole files, so that no program is compiled with both: contracts,
+# derivatives, images, detectors, the closed loop with its mirror symmetry, and the robot's behaviour. Gradients through
+# body and eyes take longer to compile so than all of these.
+DEFAULT_XLA_FILES = (
+    "test_contract.py",
+    "test_gradients.py",
+    "test_camera.py",
+    "test_laser.py",
+    "test_lgmd.py",
+    "test_closed_loop.py",
+    "test_behaviour.py",
+    "test_conftest.py",
+)
 
 import jax
 import jaxtyping
@@ -30,7 +42,6 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -43,11 +54,17 @@ def pytest_configure(config: pytest.Config) -> None:
         jaxtyping.install_import_hook("lgmdjax", "shapecheck.check")
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Where only the files for the default flags are asked for, do not import the others in every process."""
+    is_other = collection_path.suffix == ".py" and collection_path.name not in DEFAULT_XLA_FILES
+    return True if is_other and config.getoption("markexpr") == "default_xla" else None
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests for XLA's default flags; run files with slow tests first, so that none is left at the end."""
     for item in items:
-        if item.path.name in DEFAULT_XLA_FILES or "mirror" in item.name:
+        if item.path.name in DEFAULT_XLA_FILES:
             item.add_marker("default_xla")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)

@@ -26,7 +26,6 @@ def test_strict_refuses_mixed_types() -> None:
         _ = jnp.ones(1) + jnp.arange(1)
 
 
-@pytest.mark.default_xla
 @pytest.mark.skipif(not conftest.DEFAULT_XLA, reason="LGMDJAX_TEST_DEFAULT_XLA=1 asks for the default flags")
 def test_default_flags_are_those_of_users() -> None:
     assert "fusion" not in os.environ.get("XLA_FLAGS", "")

@@ -45,13 +45,11 @@ def test_readme_shows_files_that_are_there():
 
 @pytest.mark.slow
 def test_the_python_of_the_readme_runs(tmp_path):
-    """With walks of a second instead of half a minute, in a process of its own, compiled as a user compiles it."""
+    """With walks of a second instead of half a minute, in a process of its own; the smoke run has its program."""
     (program,) = python_blocks(ROOT / "README.md")
     short = program.replace("seconds=30", "seconds=1")
     assert short != program
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    for name in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES"):  # of conftest.py; the first notebook shares the program
-        environment.pop(name, None)
     done = subprocess.run(
         [sys.executable, "-c", short], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )

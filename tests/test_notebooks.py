@@ -78,9 +78,8 @@ def test_notebook_is_committed_in_normal_form(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_gives_the_committed_outputs(path, monkeypatch):
-    for name in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES"):  # of conftest.py: the kernel compiles what users run
-        monkeypatch.delenv(name, raising=False)
+def test_notebook_gives_the_committed_outputs(path):
+    """With the flags of conftest.py, with which other tests have compiled the rollout."""
     committed, executed = code_cells(nbformat.read(path, as_version=4)), code_cells(execute.execute(path))
     for expected, found in zip(committed, executed, strict=True):
         assert kinds(found) == kinds(expected), expected.source

@@ -9,5 +9,6 @@ from . import program_cache as program_cache
 from . import pytree_json as pytree_json
 from . import run_folders as run_folders
 from . import schema as schema
+from . import static_arguments as static_arguments
 from . import storage as storage
 from . import versions as versions

@@ -1,13 +1,14 @@
 """Cache traced programs on disk, beside the programs that JAX has compiled.
 
-JAX's own cache spares compilation by XLA, but not tracing by Python: to trace the gradient of a closed-loop rollout,
-transpose it and lower it takes more than half a minute in every process. `cached_jit` is a `jax.jit` that also stores
-the result of that work (`jax.export`, 1 to 2 MB), in a folder of JAX's cache. Another process reads it in seconds.
+JAX's own cache spares compilation by XLA, but not tracing by Python: to trace a closed-loop rollout and lower it takes
+ten seconds in every process, its gradient more than half a minute. `cached_jit` is a `jax.jit` that also stores the
+result of that work (`jax.export`, 1 to 2 MB), in a folder of JAX's cache. Another process reads it in seconds.
 
 A stored program is used again only if all of these are the same: function, static arguments, structure, shapes and
 precision of the other arguments, every byte of this package when it was imported, versions of JAX and MJX, devices, and
 JAX's settings. Attributes that are replaced in an imported module (monkeypatching) are not noticed; disable the cache
-for that.
+for that. Static arguments may contain functions. A program is stored only if all of them are functions of this package
+and no closures, since the source of others may change unnoticed.
 
 | exported/<function>-<key>-<release>.program | content                                                        |
 | ------------------------------------------- | -------------------------------------------------------------- |
@@ -34,7 +35,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar, overload
@@ -49,7 +50,7 @@ from jaxtyping import Array, PyTree
 
 from lgmdjax.errors import one_line
 from lgmdjax.paths import PACKAGE_DIR
-from lgmdjax.runtime import checksums, partial_files, pytree_json
+from lgmdjax.runtime import checksums, partial_files, pytree_json, static_arguments
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -88,9 +89,12 @@ class CachedFunction(Generic[P, R]):
     def program(self, *args: P.args, **kwargs: P.kwargs) -> jax.stages.Wrapped:
         """Find the program for such arguments in memory or on disk, or trace it; return a `jax.jit` of it."""
         types = jax.tree.map(lambda leaf: str(jax.typeof(leaf)), args)
-        key = _program_key(self._function, types, kwargs)
         inside_trace = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
-        folder = None if inside_trace else _cache_folder()
+        try:
+            static, folder = static_arguments.describe(kwargs), None if inside_trace else _cache_folder()
+        except ValueError:
+            static, folder = kwargs, None
+        key = _program_key(self._function, types, static)
         if (key, folder) not in self._programs:
             function = functools.partial(self._function, **kwargs)
             if folder is not None and _is_usable(folder):
@@ -116,7 +120,7 @@ def cached_jit(function: Any = None, *, donate_argnames: tuple[str, ...] = ()) -
     differentiated.
 
     Args:
-        function: pure, and no closure.
+        function: pure, and no closure. Its static arguments are plain values, dataclasses and functions.
         donate_argnames: names of arguments whose memory the results may use (`jax.jit`).
     """
     if function is None:
@@ -145,14 +149,14 @@ def _release() -> str:
     return checksums.digest(repr((PACKAGE_DIGEST, *_library_versions())).encode())[:16]
 
 
-def _program_key(function: Callable[..., object], types: PyTree[str], static: Mapping[str, object]) -> str:
+def _program_key(function: Callable[..., object], types: PyTree[str], static: object) -> str:
     """Return a hash of everything that a program depends on."""
     name = function.__module__, function.__qualname__
     # All settings that could change what is traced, and many that do not: tracing once too often does less harm.
     names = [name for name in sorted(jax.config.values) if "cache" not in name]
     settings = [str(getattr(jax.config, name, jax.config.values[name])) for name in names]
     devices = [jax.default_backend(), jax.local_device_count()]
-    everything = name, types, sorted(static.items()), _release(), settings, devices
+    everything = name, types, static, _release(), settings, devices
     # As text: pickle gives other bytes for equal values if parts of them are one object.
     with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
         return checksums.digest(repr(everything).encode())[:32]

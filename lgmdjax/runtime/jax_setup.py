@@ -22,12 +22,12 @@ COUNT = "JAX_NUM_CPU_DEVICES"
 def prepare_jax() -> None:
     """Set the environment variables of JAX that the user has not set.
 
-    Compiled programs are cached in ~/.cache/lgmdjax/jax, or not at all for a user without a home folder. Each CPU core
-    becomes a device, over which robots are sharded, and XLA logs less.
+    Compiled programs, the many small ones too, are cached in ~/.cache/lgmdjax/jax, or not at all for a user without a
+    home folder. Each CPU core becomes a device, over which robots are sharded, and XLA logs less.
     """
     if home := _cache_home():
         _set_default("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
-    _set_default("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    _set_default("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     _set_default(COUNT, str(cores))
     # XLA logs its own tuning flags as errors whenever it reads a compiled program; real errors raise an exception.

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lgmdjax.control.policies import Policy
+from lgmdjax.runtime.export_cache import cached_jit
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import closed_loop, finite
 from lgmdjax.simulation.closed_loop import Params, Record, Room, State
@@ -55,18 +56,21 @@ def reset_batch(params: Params, model: mjx.Model, rooms: Room, *, policy: Policy
     return shard_robots(jax.vmap(lambda room: closed_loop.init(params, model, room, policy)), rooms)
 
 
-@partial(jax.jit, static_argnames=("policy", "frames"), donate_argnames="states")
+@partial(cached_jit, donate_argnames=("states",))
 def rollout_batch(
     params: Params,
     model: mjx.Model,
     rooms: Room,
     states: State,
+    render: Bool[Array, ""] | bool,
     *,
     policy: Policy,
     frames: int,
-    render: Bool[Array, ""] | bool,
 ) -> tuple[State, Record]:
-    """Roll out a batch of robots, each in its own room; the record's axes are (robot, frame)."""
+    """Roll out a batch of robots, each in its own room; the record's axes are (robot, frame).
+
+    One program serves rollouts with and without pictures, and is kept on disk.
+    """
 
     def step(room: Room, state: State, _: None) -> tuple[State, Record]:
         return closed_loop.step(params, model, room, state, policy, render=render)
@@ -119,7 +123,7 @@ def rollout_chunks(
     total = round(seconds * closed_loop.FRAME_RATE)
     states = reset_batch(params, model, rooms, policy=policy)
     for done in range(0, total, frames):
-        states, record = rollout_batch(params, model, rooms, states, policy=policy, frames=frames, render=render)
+        states, record = rollout_batch(params, model, rooms, states, render, policy=policy, frames=frames)
         chunk = jax.tree.map(lambda leaf, left=total - done: np.asarray(leaf)[:, :left], record)
         yield finite.flag_nonfinite(chunk)
 

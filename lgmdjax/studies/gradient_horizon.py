@@ -94,7 +94,7 @@ def states_before_end(
     for left in range(END_FRAME, 0, -1):
         if left in HORIZONS:
             found[left] = jax.tree.map(jnp.copy, states)  # `rollout_batch` donates its states
-        states, _ = rollout.rollout_batch(robot, model, rooms, states, policy=policies.LEARNED, frames=1, render=True)
+        states, _ = rollout.rollout_batch(robot, model, rooms, states, True, policy=policies.LEARNED, frames=1)
     return found
 
 

@@ -258,37 +258,41 @@ def test_an_unknown_name_is_answered_with_those_that_exist(
     assert choice in capsys.readouterr().err
 
 
-def help_text(*arguments: str, heavy: tuple[str, ...] = HEAVY) -> str:
-    """Print help in a new process, which must not load heavy modules, and return it."""
+def help_texts(*calls: tuple[str, ...], heavy: tuple[str, ...] = HEAVY) -> list[str]:
+    """Print the help of each call in one new process, which must not load heavy modules, and return the texts."""
     program = (
-        "import sys\nfrom lgmdjax.cli import main\n"
-        "try: main.main(sys.argv[1:])\n"
-        "except SystemExit as ended: assert ended.code == 0\n"
+        "import json, sys\nfrom lgmdjax.cli import main\n"
+        "for call in json.loads(sys.argv[1]):\n"
+        "    try: main.main(call)\n"
+        "    except SystemExit as ended: assert ended.code == 0\n"
+        "    print(chr(12), end='')\n"
         f"print('heavy:', sorted(set({heavy}) & set(sys.modules)))"
     )
     environment = os.environ | {"PYTHONPATH": str(paths.PACKAGE_DIR.parent)}
-    command = [sys.executable, "-c", program, *arguments]
+    command = [sys.executable, "-c", program, json.dumps(calls)]
     out = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-    assert out.endswith("heavy: []\n"), out
-    return out
+    *texts, loaded = out.split(chr(12))
+    assert loaded == "heavy: []\n" and len(texts) == len(calls), out
+    return texts
 
 
 def test_help_and_version_load_nothing_heavy() -> None:
-    assert help_text("--version", heavy=(*HEAVY, "tyro")).startswith(f"lgmdjax {__version__}\n")
-    text = help_text("--help", heavy=(*HEAVY, "tyro"))
-    assert all(f"  {name} " in text for name in main.COMMANDS)
-    text = help_text("study", "--help", heavy=(*HEAVY, "tyro"))
-    assert all(name in text and question in text for name, question in main.STUDIES.items())
+    calls = ("--version",), ("--help",), ("study", "--help")
+    version, commands, studies = help_texts(*calls, heavy=(*HEAVY, "tyro"))
+    assert version == f"lgmdjax {__version__}\n"
+    assert all(f"  {name} " in commands for name in main.COMMANDS)
+    assert all(name in studies and question in studies for name, question in main.STUDIES.items())
 
 
-@pytest.mark.parametrize("command", [name for name in main.COMMANDS if name != "study"])
-def test_help_of_a_command_loads_no_jax(command: str) -> None:
-    text = help_text(command, "--help")
-    if command in STAGES:
+def test_help_of_a_command_loads_no_jax() -> None:
+    names = [name for name in main.COMMANDS if name != "study"]
+    texts = dict(zip(names, help_texts(*((name, "--help") for name in names)), strict=True))
+    assert all(f"lgmdjax {name}" in text for name, text in texts.items())
+    for name in STAGES:
         for flag in ("--fit-gait.steps", "--collect.eyes.width", "--train.epochs", "--evaluate.testing.seeds"):
-            assert flag in text
+            assert flag in texts[name], name
 
 
 def test_help_of_a_study_loads_no_jax() -> None:
-    text = help_text("study", "gait_gradient", "--help")
+    (text,) = help_texts(("study", "gait_gradient", "--help"))
     assert main.STUDIES["gait_gradient"] in text and "--settings.learning-rate" in text

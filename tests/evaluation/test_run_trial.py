@@ -13,7 +13,7 @@ from synthetic import walk
 
 from lgmdjax import geometry
 from lgmdjax.body import hexapod
-from lgmdjax.cli import flags
+from lgmdjax.cli import flags, main
 from lgmdjax.cli import trial as cli_trial
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import run_trial
@@ -90,10 +90,10 @@ def test_an_unknown_name_is_an_input_error(tmp_path, trial, policy):
         (("tube", "--run", "nowhere"), "`lgmdjax train` makes one"),
     ],
 )
-def test_wrong_arguments_give_an_error_of_one_line(tmp_path, arguments, line):
-    done = trial(*arguments, "--out", str(tmp_path / "out"))
-    assert done.returncode == 2
-    assert line in done.stderr and done.stderr.count("\n") == 1
+def test_wrong_arguments_give_an_error_of_one_line(tmp_path, capsys, arguments, line):
+    assert main.main(["trial", *arguments, "--out", str(tmp_path / "out")]) == 2
+    stderr = capsys.readouterr().err
+    assert line in stderr and stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 

@@ -102,7 +102,6 @@ def test_three_routes_agree_over_one_frame(params, check):
     check.assert_every_leaf_agrees(params.controller, weights)
 
 
-@pytest.mark.default_xla
 def test_the_gradient_through_the_controller_is_that_of_imitation_on_the_recorded_walk(params, rolled_out):
     """The navigator alone, on the recorded u, with constant labels."""
     start, _, record, gradient = rolled_out

@@ -21,6 +21,7 @@ import pytest
 from flax import struct
 from jax import export
 
+from lgmdjax import minmax
 from lgmdjax.runtime import export_cache
 from lgmdjax.simulation import sharding
 
@@ -83,6 +84,23 @@ def test_decorates_with_and_without_options():
 
     assert halve(double(jnp.ones(()))) == 1.0
     assert (halve.__name__, halve.__doc__) == ("halve", "Halve a number.")
+
+
+def test_a_static_function_is_kept_only_if_the_package_has_it(cache):
+    """Another's source may change; its program is compiled in memory alone, one for each function."""
+    traces = []
+
+    def apply(x, *, function):
+        traces.append(function)
+        return function(x, 2 * x)
+
+    for _ in range(2):
+        cached = export_cache.cached_jit(apply)
+        assert cached(jnp.ones(()), function=minmax.maximum) == 2.0
+    assert len(traces) == len(list(cache.iterdir())) == 1
+    for own, expected in (((lambda a, b: a + b), 3.0), ((lambda a, b: a - b), -1.0)):
+        assert cached(jnp.ones(()), function=own) == expected
+    assert len(list(cache.iterdir())) == 1
 
 
 @struct.dataclass
@@ -397,6 +415,7 @@ def test_its_program_can_be_lowered(cache, counted):
 OTHER = """
 import jax
 jax.config.update("jax_enable_x64", True)
+from lgmdjax import minmax
 from lgmdjax.runtime import export_cache
 
 def solve(A):

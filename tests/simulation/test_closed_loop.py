@@ -53,13 +53,14 @@ def room():
 
 @pytest.fixture(scope="module")
 def run(params, model):
-    """A compiled rollout of FRAMES frames from a state, for the policy of an index."""
+    """A compiled rollout of FRAMES frames from a state, for any policy, with pictures or without."""
 
     @jax.jit
-    def run(active, room, state):
-        return rollout.rollout(activated(params, active), model, room, state, policies.SWITCH, frames=FRAMES)
+    def run(active, room, state, render):
+        robot = activated(params, active)
+        return rollout.rollout(robot, model, room, state, policies.SWITCH, frames=FRAMES, render=render)
 
-    return lambda policy, room, state: run(policies.POLICIES.index(policy), room, state)
+    return lambda policy, room, state, render=True: run(policies.POLICIES.index(policy), room, state, render)
 
 
 @pytest.fixture(scope="module")
@@ -145,11 +146,9 @@ def test_robot_that_is_not_finite_is_frozen_and_flagged(run, start, room):
     assert not bool(end.ok)
 
 
-def test_blind_rollout_is_the_same_without_rendering(params, model, start, room, run):
+def test_blind_rollout_is_the_same_without_rendering(start, room, run):
     _, rendered = run(policies.BLIND, room, start)
-    blind = activated(params, jnp.asarray(policies.POLICIES.index(policies.BLIND)))
-    black = jax.jit(lambda s: rollout.rollout(blind, model, room, s, policies.SWITCH, frames=FRAMES, render=False))
-    _, record = black(start)
+    _, record = run(policies.BLIND, room, start, render=False)
     np.testing.assert_allclose(record.position, rendered.position, atol=1e-9)
     np.testing.assert_array_equal(record.u, 0.5)
 

@@ -26,7 +26,7 @@ def test_pictures_are_rendered_again_from_the_poses(tmp_path):
     states, frames = rollout.reset_batch(params, model, rooms, policy=blind), []
     writer = episodes.Writer(tmp_path, {})
     for _ in range(FRAMES):
-        states, chunk = rollout.rollout_batch(params, model, rooms, states, policy=blind, frames=1, render=True)
+        states, chunk = rollout.rollout_batch(params, model, rooms, states, True, policy=blind, frames=1)
         left, right = np.moveaxis(np.asarray(states.controller.lgmd.frame), 1, 0)
         frames.append(np.stack([left, right[..., ::-1]], axis=1))  # the detectors see the outermost column first
         writer.write(chunk, episode=0, rooms=range(ROBOTS), seed=1)

@@ -16,7 +16,7 @@ from lgmdjax.learning import gait_objective
 from lgmdjax.locomotion import shaping
 from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.sensors.settings import CameraSettings
-from lgmdjax.simulation import assembly, closed_loop, room_batches
+from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches
 from lgmdjax.studies import gait_gradient, gradient_horizon
 from lgmdjax.studies.settings import GaitGradientSettings, GradientHorizonSettings
 
@@ -120,6 +120,8 @@ def synthetic_step(monkeypatch, unchecked):
         return replace(state, controller=replace(state.controller, velocity=velocity), frame=state.frame + 1), record
 
     monkeypatch.setattr(closed_loop, "step", step)
+    batch: Any = rollout.rollout_batch  # would be kept on disk as a program of the real step
+    monkeypatch.setattr(rollout, "rollout_batch", jax.jit(batch.__wrapped__, static_argnames=("policy", "frames")))
 
 
 class Commands(NamedTuple):

@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 import small_rooms
 
-from lgmdjax.body import hexapod
-from lgmdjax.control import policies
 from lgmdjax.detectors import lgmd
 from lgmdjax.learning.settings import TrainSettings
 from lgmdjax.paths import PRETRAINED_DIR
@@ -50,10 +48,10 @@ def rooms() -> closed_loop.Room:
 
 
 def walk_blindly(robot: closed_loop.Params, rooms: closed_loop.Room) -> closed_loop.Record:
-    chunks = recording.rollout_with_progress(
-        assembly.select_policy(robot, policies.BLIND), hexapod.build(), rooms, SECONDS, "blind", render=False
-    )
-    return rollout.concatenate_time(list(chunks))
+    """In batches of four, whose program the smoke run has compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "BATCH_SIZES", (4,))
+        return recording.rollout(robot, rooms, seconds=SECONDS, policy="blind", render=False)
 
 
 @pytest.fixture(scope="module")
