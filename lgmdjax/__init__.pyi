@@ -3,6 +3,7 @@ __version__: str
 from . import body as body
 from . import cli as cli
 from . import control as control
+from . import datasets as datasets
 from . import deployment as deployment
 from . import detectors as detectors
 from . import evaluation as evaluation

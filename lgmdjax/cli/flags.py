@@ -24,6 +24,7 @@ from tyro.constructors import (
 )
 
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
+from lgmdjax.datasets.formats import DatasetFormat
 from lgmdjax.deployment.formats import FORMATS, PRETRAINED, Format
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation.settings import BenchScale, TrialName, TrialPlan
@@ -156,6 +157,22 @@ class ExportFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DatasetFlags:
+    """The recorded walks, and the data set that is made of them."""
+
+    run: tyro.conf.Positional[Path]
+    """run folder, whose teacher's walks are exported; or any folder with recorded walks, such as that of a trial"""
+    out: tyro.conf.Positional[Path]
+    """folder to write, which must be empty or missing"""
+    format: DatasetFormat = "lerobot"
+    """lerobot is LeRobotDataset v3.0; the others are plain tables and arrays"""
+    video: bool = False
+    """render both eyes' pictures again from the poses, for lerobot (H.264) and zarr (without loss)"""
+    licence: str = "Apache-2.0"
+    """licence that you give the data, by its name in the SPDX list; it stands in the card"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorFlags:
     """The folder that is checked."""
 
@@ -227,6 +244,11 @@ def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
 def parse_bench(description: str, arguments: Sequence[str]) -> BenchFlags:
     """Read the flags of command bench."""
     return parse(BenchFlags(on=tyro.MISSING), "bench", description, arguments)
+
+
+def parse_dataset(description: str, arguments: Sequence[str]) -> DatasetFlags:
+    """Read the flags of command export-dataset."""
+    return parse(DatasetFlags(run=tyro.MISSING, out=tyro.MISSING), "export-dataset", description, arguments)
 
 
 def parse_export(description: str, arguments: Sequence[str]) -> ExportFlags:

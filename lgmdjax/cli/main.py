@@ -24,7 +24,7 @@ from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import prepare_jax
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
-NOT_RESUMED = ("watch", "export", "bench", "doctor")
+NOT_RESUMED = ("watch", "export", "export-dataset", "bench", "doctor")
 MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
@@ -108,6 +108,18 @@ def export(arguments: Sequence[str]) -> None:
         print(line)
 
 
+def export_dataset(arguments: Sequence[str]) -> None:
+    """Write recorded walks as a data set: LeRobot, CSV, Parquet or Zarr, with a card."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse_dataset(_summary(export_dataset), arguments)
+    environment.start_jax()
+    from lgmdjax.datasets import exporter
+
+    for file in exporter.export(given.run, given.out, given.format, video=given.video, licence=given.licence):
+        print(file)
+
+
 def bench(arguments: Sequence[str]) -> None:
     """Compare looming detectors on laboratory stimuli: table, JSON, figure."""
     from lgmdjax.cli import flags
@@ -141,6 +153,7 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "study": study,
     "watch": watch,
     "export": export,
+    "export-dataset": export_dataset,
     "bench": bench,
     "doctor": doctor,
 }
