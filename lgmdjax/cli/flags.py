@@ -9,7 +9,7 @@ import argparse
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args
 
@@ -49,6 +49,8 @@ class PipelineFlags:
     """seed of all random numbers"""
     name: str = ""
     """name of the run folder; if empty, <scale>-<seed> and each setting that is changed: quick-0_train.epochs=200"""
+    track: str = ""
+    """who gets the curves of fits: tensorboard, or module:function of your own log(step, values)"""
     settings: Annotated[Mapping[str, object], tyro.conf.arg(name="")]
 
 
@@ -64,6 +66,8 @@ class StudyFlags:
     """folder that holds the folders of the studies"""
     name: str = ""
     """name of the study's folder; if empty, <study>-<seed> and each setting that is changed: velocity-0_robots=4"""
+    track: str = ""
+    """who gets the curves of fits: tensorboard, or module:function of your own log(step, values)"""
     settings: object
 
 
@@ -195,7 +199,7 @@ def parse_pipeline(command: str, description: str, arguments: Sequence[str]) -> 
         if flag.endswith(".trial"):
             raise InputError(f"expected --{flag} as it is, got {value}; change the settings of another trial")
     name = flags.name or name_run(f"{flags.scale}-{flags.seed}", preset, settings)
-    return PipelineFlags(scale=flags.scale, out=flags.out, seed=flags.seed, name=name, settings=settings)
+    return replace(flags, name=name, settings=settings)
 
 
 def parse_study(study: str, question: str, arguments: Sequence[str]) -> StudyFlags:
@@ -207,7 +211,7 @@ def parse_study(study: str, question: str, arguments: Sequence[str]) -> StudyFla
     settings = _keep_preset(preset, flags.settings)
     check_settings(settings, "settings")
     name = flags.name or name_run(f"{study}-{flags.seed}", preset, settings)
-    return StudyFlags(run=flags.run, seed=flags.seed, out=flags.out, name=name, settings=settings)
+    return replace(flags, name=name, settings=settings)
 
 
 def parse(flags: FlagsT, command: str, description: str, arguments: Sequence[str]) -> FlagsT:

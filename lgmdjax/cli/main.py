@@ -281,14 +281,16 @@ def _summary(command: Callable[[Sequence[str]], int | None]) -> str:
 
 def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequence[str]], None]) -> Path:
     """Run the stages up to a target in the run folder of the flags; return the folder of the target."""
-    from lgmdjax.cli import flags
+    from lgmdjax.cli import flags, tracking
 
     name = command.__name__.replace("_", "-")
     given = flags.parse_pipeline(name, _summary(command), arguments)
+    tracking.check(given.track)
     environment.start_jax()
     from lgmdjax.runtime.run_folders import execute, open_run
 
     run = open_run(given.out, given.name, given.scale, given.seed, given.settings)
     from lgmdjax.pipeline.stages import STAGES
 
-    return execute(run, STAGES, target)
+    with tracking.following(given.track, run.folder):
+        return execute(run, STAGES, target)

@@ -10,4 +10,5 @@ from . import pytree_json as pytree_json
 from . import run_folders as run_folders
 from . import schema as schema
 from . import storage as storage
+from . import tracking as tracking
 from . import versions as versions

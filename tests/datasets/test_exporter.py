@@ -132,7 +132,7 @@ def lerobot(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_lerobot_has_an_episode_from_each_start_to_the_next(run: Path, lerobot: Path):
-    """Layout, indices and numbers as LeRobot's documentation of version 3.0 has them; 5 frames of a fallen robot are out."""
+    """Layout, indices and numbers as LeRobot's documentation of version 3.0 has them; no fallen robot."""
     info = json.loads((lerobot / "meta" / "info.json").read_text())
     assert (info["codebase_version"], info["fps"], info["total_episodes"], info["total_frames"]) == ("v3.0", 30, 3, 75)
     table = pd.read_parquet(lerobot / info["data_path"].format(chunk_index=0, file_index=0))
