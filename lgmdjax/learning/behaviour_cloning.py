@@ -37,7 +37,7 @@ import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.control import navigator
 from lgmdjax.errors import InputError

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 
-
 Log = Callable[[int, Mapping[str, float]], None]
 """`log(step, values)`: takes values of one step of a fit, which is an epoch, an update or a window."""
 

@@ -50,7 +50,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import controller, policies

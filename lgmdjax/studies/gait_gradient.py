@@ -38,7 +38,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, PyTree
 from matplotlib.figure import Figure
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.evaluation import gait_test
