@@ -14,18 +14,18 @@ FILES_PER_CHUNK = 1000
 
 FEATURES: Mapping[str, tuple[str, ...]] = {
     "observation.state": ("joints",),
-    "observation.pose": ("position", "quaternion"),
+    "pose": ("position", "quaternion"),
     "observation.lgmd": ("u",),
     "observation.feed_forward": ("feed_forward",),
     "observation.excitation": ("excitation",),
-    "observation.distance": ("distances",),
-    "observation.corridor": ("corridor",),
+    "laser.distance": ("distances",),
+    "laser.corridor": ("corridor",),
     "action": ("velocity",),
-    "action.teacher": ("label",),
+    "teacher.velocity": ("label",),
     "clearance": ("clearance",),
     "contact": ("contact",),
 }
-"""The fields of `Record` in each feature."""
+"""The fields of `Record` in each feature. LeRobot gives a policy what begins with "observation"; no other is sensed."""
 CAMERAS = tuple(f"observation.images.{side}" for side in SIDES)
 INDICES = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"}
 INDICES |= {"task_index": "int64", "next.done": "bool"}
