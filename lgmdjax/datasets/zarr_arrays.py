@@ -97,5 +97,5 @@ def _create(
         "dimension_names": list(axes),
         "attributes": attributes,
     }
-    store = {"driver": "file", "path": f"{path}/"}
+    store = {"driver": "file", "path": f"{path.resolve()}/"}
     return tensorstore.open({"driver": "zarr3", "kvstore": store, "metadata": metadata}, create=True).result()

@@ -178,7 +178,7 @@ def test_lerobot_videos_show_what_the_eyes_saw(run: Path, lerobot: Path):
             frames = [(frame.time, frame.to_ndarray(format="gray")) for frame in container.decode(video=0)]
         assert [round(time * 30) for time, _ in frames] == list(range(75))
         shown = np.stack([picture for _, picture in frames[40:]])
-        assert np.abs(shown.astype(float) - expected[:, side]).mean() < 4  # of 255: H.264 loses a little
+        assert np.abs(shown.astype(float) - expected[:, side]).mean() < 6  # of 255: H.264 loses a little
         mean = np.ravel(stats[f"observation.images.{name}"]["mean"])
         np.testing.assert_allclose(mean, np.mean([picture for _, picture in frames]) / 255, atol=0.02)
 
@@ -221,7 +221,7 @@ def test_wrong_requests_are_one_line(run: Path, tmp_path: Path, capsys: pytest.C
     (tmp_path / "full" / "mine").touch()
     out = str(tmp_path / "out")
     unknown = tmp_path / "unknown"
-    episodes.Writer(unknown, {"who": "me"}).write(walk_of(1, 6), episode=0, rooms=[0], seed=0)
+    episodes.Writer(unknown, {"who": "me"}).write(walk_of(2, 12), episode=0, rooms=[0, 1], seed=0)
     for arguments, words in (
         ([str(tmp_path), out], "without; `lgmdjax collect` makes some"),
         ([str(run), out, "--format", "csv", "--video"], "--video with format lerobot or zarr, got csv"),
