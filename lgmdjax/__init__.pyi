@@ -3,6 +3,7 @@ __version__: str
 from . import body as body
 from . import cli as cli
 from . import control as control
+from . import datasets as datasets
 from . import deployment as deployment
 from . import detectors as detectors
 from . import evaluation as evaluation
@@ -24,6 +25,7 @@ from .evaluation.metrics import score as score
 from .evaluation.run_trial import run_trial as run_trial
 from .locomotion import cpg as cpg
 from .reporting.figures.trajectories import plot_walks as plot_walks
+from .reporting.inline_video import show_walk as show_walk
 from .reporting.walk_video import write_video as write_video
 from .sensors import camera as camera
 from .sensors import laser as laser

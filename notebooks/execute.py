@@ -4,7 +4,7 @@
     python notebooks/execute.py 02_looming      # those named
 
 Pictures are small PNGs with a palette. Messages on stderr, progress bars, times, versions and text representations of
-pictures are left out.
+pictures and tables are left out.
 """
 
 import base64
@@ -64,6 +64,8 @@ def _normalise_output(output: NotebookNode) -> NotebookNode | None:
     if output.output_type == "stream":
         output.text = DROPPED_LINES.sub("", output.text)
         return output if output.name == "stdout" and output.text.strip() else None
+    if "text/html" in output.get("data", {}):
+        output.data = {"text/html": output.data["text/html"]}
     if "image/png" in output.get("data", {}):
         output.data = {"image/png": _reduce_picture(output.data["image/png"])}
         output.metadata = {}

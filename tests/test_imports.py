@@ -12,6 +12,7 @@ WINGS = (
     "cli",
     "pipeline",
     "studies",
+    "datasets",
     "learning",
     "evaluation",
     "reporting",

@@ -40,8 +40,9 @@ def kinds(cell: NotebookNode) -> list[tuple[str, ...]]:
 
 def text(cell: NotebookNode) -> str:
     """Return all that a cell prints or shows as text."""
-    outputs = [output.get("text") or output.get("data", {}).get("text/plain", "") for output in cell.outputs]
-    return "\n".join(outputs)
+    shown = [output.get("data", {}) for output in cell.outputs]
+    tables = [data.get("text/html") or data.get("text/plain", "") for data in shown]
+    return "\n".join(output.get("text") or table for output, table in zip(cell.outputs, tables, strict=True))
 
 
 def test_normalisation_keeps_results_and_drops_the_rest():

@@ -5,5 +5,6 @@ from . import export as export
 from . import flags as flags
 from . import main as main
 from . import study as study
+from . import tracking as tracking
 from . import trial as trial
 from . import watch as watch

@@ -9,7 +9,7 @@ import argparse
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar, get_args
 
@@ -24,6 +24,7 @@ from tyro.constructors import (
 )
 
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
+from lgmdjax.datasets.formats import DatasetFormat
 from lgmdjax.deployment.formats import FORMATS, PRETRAINED, Format
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation.settings import BenchScale, TrialName, TrialPlan
@@ -48,6 +49,8 @@ class PipelineFlags:
     """seed of all random numbers"""
     name: str = ""
     """name of the run folder; if empty, <scale>-<seed> and each setting that is changed: quick-0_train.epochs=200"""
+    track: str = ""
+    """who gets the curves of fits: tensorboard, or module:function of your own log(step, values)"""
     settings: Annotated[Mapping[str, object], tyro.conf.arg(name="")]
 
 
@@ -63,6 +66,8 @@ class StudyFlags:
     """folder that holds the folders of the studies"""
     name: str = ""
     """name of the study's folder; if empty, <study>-<seed> and each setting that is changed: velocity-0_robots=4"""
+    track: str = ""
+    """who gets the curves of fits: tensorboard, or module:function of your own log(step, values)"""
     settings: object
 
 
@@ -164,6 +169,22 @@ class ExportFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DatasetFlags:
+    """The recorded walks, and the data set that is made of them."""
+
+    run: tyro.conf.Positional[Path]
+    """run folder, whose teacher's walks are exported; or any folder with recorded walks, such as that of a trial"""
+    out: tyro.conf.Positional[Path]
+    """folder to write, which must be empty or missing"""
+    format: DatasetFormat = "lerobot"
+    """lerobot is LeRobotDataset v3.0; the others are plain tables and arrays"""
+    video: bool = False
+    """render both eyes' pictures again from the poses, for lerobot (H.264) and zarr (without loss)"""
+    licence: str = "Apache-2.0"
+    """licence that you give the data, by its name in the SPDX list; it stands in the card"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorFlags:
     """The folder that is checked."""
 
@@ -186,7 +207,7 @@ def parse_pipeline(command: str, description: str, arguments: Sequence[str]) -> 
         if flag.endswith(".trial"):
             raise InputError(f"expected --{flag} as it is, got {value}; change the settings of another trial")
     name = flags.name or name_run(f"{flags.scale}-{flags.seed}", preset, settings)
-    return PipelineFlags(scale=flags.scale, out=flags.out, seed=flags.seed, name=name, settings=settings)
+    return replace(flags, name=name, settings=settings)
 
 
 def parse_study(study: str, question: str, arguments: Sequence[str]) -> StudyFlags:
@@ -198,7 +219,7 @@ def parse_study(study: str, question: str, arguments: Sequence[str]) -> StudyFla
     settings = _keep_preset(preset, flags.settings)
     check_settings(settings, "settings")
     name = flags.name or name_run(f"{study}-{flags.seed}", preset, settings)
-    return StudyFlags(run=flags.run, seed=flags.seed, out=flags.out, name=name, settings=settings)
+    return replace(flags, name=name, settings=settings)
 
 
 def parse(flags: FlagsT, command: str, description: str, arguments: Sequence[str]) -> FlagsT:
@@ -235,6 +256,11 @@ def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
 def parse_bench(description: str, arguments: Sequence[str]) -> BenchFlags:
     """Read the flags of command bench."""
     return parse(BenchFlags(on=tyro.MISSING), "bench", description, arguments)
+
+
+def parse_dataset(description: str, arguments: Sequence[str]) -> DatasetFlags:
+    """Read the flags of command export-dataset."""
+    return parse(DatasetFlags(run=tyro.MISSING, out=tyro.MISSING), "export-dataset", description, arguments)
 
 
 def parse_export(description: str, arguments: Sequence[str]) -> ExportFlags:

@@ -24,7 +24,7 @@ from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import prepare_jax
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
-NOT_RESUMED = ("watch", "export", "bench", "doctor")
+NOT_RESUMED = ("watch", "export", "export-dataset", "bench", "doctor")
 MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
@@ -108,6 +108,18 @@ def export(arguments: Sequence[str]) -> None:
         print(line)
 
 
+def export_dataset(arguments: Sequence[str]) -> None:
+    """Write recorded walks as a data set: LeRobot, CSV, Parquet or Zarr, with a card."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse_dataset(_summary(export_dataset), arguments)
+    environment.check_jax()
+    from lgmdjax.datasets import exporter
+
+    for file in exporter.export(given.run, given.out, given.format, video=given.video, licence=given.licence):
+        print(file)
+
+
 def bench(arguments: Sequence[str]) -> None:
     """Compare looming detectors on laboratory stimuli: table, JSON, figure."""
     from lgmdjax.cli import flags
@@ -141,6 +153,7 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "study": study,
     "watch": watch,
     "export": export,
+    "export-dataset": export_dataset,
     "bench": bench,
     "doctor": doctor,
 }
@@ -268,14 +281,16 @@ def _summary(command: Callable[[Sequence[str]], int | None]) -> str:
 
 def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequence[str]], None]) -> Path:
     """Run the stages up to a target in the run folder of the flags; return the folder of the target."""
-    from lgmdjax.cli import flags
+    from lgmdjax.cli import flags, tracking
 
     name = command.__name__.replace("_", "-")
     given = flags.parse_pipeline(name, _summary(command), arguments)
+    tracking.check(given.track)
     environment.check_jax()
     from lgmdjax.runtime.run_folders import execute, open_run
 
     run = open_run(given.out, given.name, given.scale, given.seed, given.settings)
     from lgmdjax.pipeline.stages import STAGES
 
-    return execute(run, STAGES, target)
+    with tracking.following(given.track, run.folder):
+        return execute(run, STAGES, target)

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from matplotlib.figure import Figure
 
+from lgmdjax.cli import tracking
 from lgmdjax.cli.flags import StudyFlags
 from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.reporting.figures import style
@@ -50,6 +51,7 @@ MODULES: Mapping[str, Study] = {
 
 def run_study(name: str, flags: StudyFlags) -> Path:
     """Run a study, or resume it, and return the folder with its table <name>.json and its figure <name>.png."""
+    tracking.check(flags.track)
     inputs = _input_folders(flags.run)
     robot = assembly.load_robot(inputs["fit-gait"], inputs["train"])
 
@@ -59,8 +61,9 @@ def run_study(name: str, flags: StudyFlags) -> Path:
         (folder / f"{name}.png").write_bytes(style.to_png(MODULES[name].plot(rows)))
 
     facts = {name: flags.settings, "robot": assembly.fingerprint(robot)}
-    folder = open_run(flags.out, flags.name or f"{name}-{flags.seed}", "study", flags.seed, facts)
-    return execute(folder, (Stage(name=name, run=work),), name)
+    run = open_run(flags.out, flags.name or f"{name}-{flags.seed}", "study", flags.seed, facts)
+    with tracking.following(flags.track, run.folder):
+        return execute(run, (Stage(name=name, run=work),), name)
 
 
 def _input_folders(run: Path | None) -> dict[str, Path]:

@@ -30,7 +30,7 @@ import pyarrow.csv
 import pyarrow.parquet
 from jaxtyping import Array, Float, UInt8
 from matplotlib.figure import Figure
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax import __version__
 from lgmdjax.cli.flags import WatchFlags

@@ -32,6 +32,7 @@ from scipy import ndimage, stats
 
 from lgmdjax import geometry
 from lgmdjax.errors import InputError
+from lgmdjax.html import Shown
 from lgmdjax.locomotion import cpg
 from lgmdjax.simulation import finite
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
@@ -60,7 +61,7 @@ class Estimate:
 
 
 @struct.dataclass(kw_only=True)
-class Progress:
+class Progress(Shown):
     """Whether robots go on: how much floor they see, and how much they turn; means over robots."""
 
     coverage: Estimate  # 1/min, new cells of `CELL`
@@ -70,7 +71,7 @@ class Progress:
 
 
 @struct.dataclass(kw_only=True)
-class Score:
+class Score(Shown):
     """Metrics of a batch of walks with one policy."""
 
     robots: int

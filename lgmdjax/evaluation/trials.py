@@ -32,6 +32,7 @@ from numpy import ndarray
 from lgmdjax import geometry
 from lgmdjax.evaluation.metrics import Estimate, wilson_proportion
 from lgmdjax.evaluation.settings import TrialName
+from lgmdjax.html import Shown
 from lgmdjax.simulation import finite, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena, scenes
@@ -45,7 +46,7 @@ TURN_BACK_ANGLE = 0.5 * np.pi  # rad from the first heading
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class Trial(Shown):
     """One trial; `make_rooms(key, seeds)` builds a room for each robot."""
 
     name: TrialName
@@ -62,7 +63,7 @@ class Trial:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class Outcome(Shown):
     """Outcome of a trial for each robot."""
 
     touched: Bool[ndarray, " robots"]  # touched something, or was lost

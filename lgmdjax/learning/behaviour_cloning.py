@@ -36,13 +36,13 @@ import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.control import navigator
 from lgmdjax.errors import InputError
 from lgmdjax.learning.checkpoints import Checkpoints, resumable
 from lgmdjax.learning.sequences import SequenceBatch, pack
-from lgmdjax.runtime import checksums
+from lgmdjax.runtime import checksums, tracking
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import finite, sharding
 from lgmdjax.simulation.episodes import Walk
@@ -231,10 +231,14 @@ def _run_epochs(
     total = settings.epochs
     steps = resumable(advance, initial, checkpoints, total=total, chunk=max(1, total // 100), interval=SAVE_EVERY)
     done, progress = next(steps)
+    name = params.variant if checkpoints is None else tracking.name_fit(checkpoints.folder)
     with tqdm(total=total, initial=done, desc=params.variant, unit="epoch", disable=not show_progress) as bar:
         for epoch, progress in steps:
             bar.set_postfix(mse=f"{progress.train[epoch - 1]:.4f}", test=f"{progress.test[epoch - 1]:.4f}")
             bar.update(epoch - done)
+            for number in range(done, epoch) if tracking.is_listening() else ():
+                curves = {"train_mse": progress.train[number], "test_mse": progress.test[number]}
+                tracking.log(number + 1, {f"{name}/{curve}": float(value) for curve, value in curves.items()})
             done = epoch
     return progress
 

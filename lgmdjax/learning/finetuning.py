@@ -29,6 +29,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.learning import rollout_gradient
 from lgmdjax.learning.checkpoints import Checkpoints, resumable
 from lgmdjax.locomotion import shaping
+from lgmdjax.runtime import tracking
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import rollout
 from lgmdjax.simulation.closed_loop import Params, Record, Room, State
@@ -80,6 +81,7 @@ def finetune(
     *,
     checkpoints: Checkpoints | None = None,
     on_window: Callable[[WindowStats], None] = lambda stats: None,
+    label: str = "finetuning",
 ) -> tuple[Params, list[WindowStats]]:
     """Follow the gradient of the imitation loss with Adam while the robots walk; return the robot and all statistics.
 
@@ -91,6 +93,7 @@ def finetune(
         settings: of the optimiser.
         checkpoints: where progress is saved after every room and resumed from; the result is the same, bit for bit.
         on_window: called with the statistics of every window.
+        label: name of the fit in the curves that are tracked (`lgmdjax.runtime.tracking`).
     """
     scales, steps = param_scales(params.controller, settings.trainable), settings.windows_per_room * settings.rooms
     # Adam's epsilon must be small beside every derivative.
@@ -105,7 +108,14 @@ def finetune(
             robot = replace(params, controller=own)
             return rollout_gradient.gradient(robot, model, rooms, states, scales, settings=gradient_settings)
 
-        return _follow(progress, states, gradient, update, windows=settings.windows_per_room, on_window=on_window)
+        first = int(progress.rooms) * settings.windows_per_room
+
+        def report(window: int, stats: WindowStats) -> None:
+            named = {f"{label}/{name}": value for name, value in stats._asdict().items()}
+            tracking.log(first + window + 1, named)
+            on_window(stats)
+
+        return _follow(progress, states, gradient, update, windows=settings.windows_per_room, report=report)
 
     initial = _initial_progress(params.controller, optimiser, steps)
     *_, (_, progress) = resumable(finetune_in_room, initial, checkpoints, total=settings.rooms)
@@ -173,16 +183,16 @@ def _follow(
     update: Update,
     *,
     windows: int,
-    on_window: Callable[[WindowStats], None],
+    report: Callable[[int, WindowStats], None],
 ) -> Progress:
     """Walk all windows in one room, with an update after each."""
     controller_params, memory, rows = progress.controller_params, progress.optimiser, []
-    for _ in range(windows):
+    for window in range(windows):
         found, states, record = gradient(controller_params, states)
         # Through the host, since a gradient is sharded over the robots' devices and parameters are not.
         controller_params, memory = update(controller_params, memory, jax.device_get(found.grad))
         rows.append(_summarise(found, record))
-        on_window(rows[-1])
+        report(window, rows[-1])
     first = int(progress.rooms) * windows
     filled = progress.rows.at[first : first + len(rows)].set(jnp.asarray(rows, float))
     return Progress(controller_params=controller_params, optimiser=memory, rooms=progress.rooms + 1, rows=filled)

@@ -33,12 +33,13 @@ import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.control import navigator
 from lgmdjax.detectors import lgmd
 from lgmdjax.learning import behaviour_cloning, sequences
 from lgmdjax.learning.settings import LgmdGradientSettings
+from lgmdjax.runtime import tracking
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import episodes
 from lgmdjax.simulation.closed_loop import FRAME_RATE, AnyArray
@@ -218,6 +219,8 @@ def fit(
             current = from_fit_params(params, {**to_fit_params(params), **fitted})
             rows.append({"step": step, "loss": float(np.mean(errors)) if errors else None, **evaluate(current)})
             best = current if rows[-1]["choice"] <= min(row["choice"] for row in rows) else best
+            known = {name: value for name, value in rows[-1].items() if name != "step" and value is not None}
+            tracking.log(step, {f"{label}/{name}": float(value) for name, value in known.items()})
             errors = []
         if step < steps:
             fitted, memory, states, error = update(fitted, memory, states, batch, jnp.asarray(step, jnp.int32))

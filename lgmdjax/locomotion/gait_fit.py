@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from lgmdjax.locomotion import cpg, kinematics, shaping, tripod_gait
 from lgmdjax.locomotion.kinematics import LegGeometry
 from lgmdjax.locomotion.tripod_gait import Gait
+from lgmdjax.runtime import tracking
 
 # Velocities and their weights in the loss. Walking backward is for turning and needs less accuracy.
 VELOCITIES = (-1.0, -0.6, -0.2, 0.2, 0.5, 0.8, 1.0, 1.2, 1.4, 1.7, 2.0)
@@ -113,15 +114,23 @@ def fit(
         printed_input: leave out the adaptation difference, as the paper does; the robot then hardly walks.
         progress: called every hundred steps.
     """
+    name = "shaping, printed input" if printed_input else "shaping"
+
+    def report(done: int, loss: Float[Array, ""]) -> None:
+        if progress:
+            progress(done, float(loss))
+        if tracking.is_listening():
+            tracking.log(done, {f"{name}/loss_mm2": float(loss)})
+
     demonstrations = _demonstrations(geometry, gait or Gait(), cpg_params or cpg.Params(), printed_input)
     keys = jax.random.split(jax.random.key(0) if key is None else key, (candidates, 3))
     networks = _initial_networks(demonstrations.inputs, demonstrations.targets, keys)
     left = replace(geometry, mounts=geometry.mounts[:3], mount_yaws=geometry.mount_yaws[:3])
     problem = _Problem(left, demonstrations)
     search_steps = steps // 8
-    networks = _minimise(_candidates_loss, networks, problem, 0.01, range(search_steps), progress=progress)
+    networks = _minimise(_candidates_loss, networks, problem, 0.01, range(search_steps), report=report)
     networks = _best_candidates(networks, problem)
-    networks = _minimise(_robot_loss, networks, problem, 0.005, range(search_steps, steps), progress=progress)
+    networks = _minimise(_robot_loss, networks, problem, 0.005, range(search_steps, steps), report=report)
     return _mirrored(networks, demonstrations, printed_input)
 
 
@@ -257,7 +266,7 @@ def _minimise(
     learning_rate: float,
     steps: range,
     *,
-    progress: Progress | None,
+    report: Callable[[int, Float[Array, ""]], None],
 ) -> _Networks:
     """Minimise a loss by Adam with a cosine schedule of the learning rate; report the progress every hundred steps."""
     state = _FitState(networks, ADAM.init(networks))
@@ -265,8 +274,7 @@ def _minimise(
         end = min(first + 100, len(steps))
         span = _Span(*(jnp.asarray(x, dtype=float) for x in (learning_rate, first, end, len(steps))))
         state, value = _adam_steps(loss, state, problem, span)
-        if progress:
-            progress(steps.start + end, float(value))
+        report(steps.start + end, value)
     return state.networks
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.evaluation import gait_test

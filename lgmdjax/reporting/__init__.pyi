@@ -1,4 +1,5 @@
 from . import figures as figures
+from . import inline_video as inline_video
 from . import lgmd_overlay as lgmd_overlay
 from . import selection as selection
 from . import third_person as third_person

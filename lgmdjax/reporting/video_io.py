@@ -88,7 +88,13 @@ def open_reader(path: Path) -> Iterator[Video]:
 
 @contextlib.contextmanager
 def open_writer(
-    target: Path | BinaryIO, width: int, height: int, rate: Fraction | int, *, fast: bool = False
+    target: Path | BinaryIO,
+    width: int,
+    height: int,
+    rate: Fraction | int,
+    *,
+    fast: bool = False,
+    key_frame_every: int | None = None,
 ) -> Iterator[Callable[[UInt8[np.ndarray, "height width channels"]], None]]:
     """Open an MP4 file for H.264 pictures of even width and height, and yield a function that writes one picture.
 
@@ -100,6 +106,7 @@ def open_writer(
         height: of the pictures [px].
         rate: frames per second.
         fast: encode in a third of the time, into a file larger by a third.
+        key_frame_every: most pictures from one key frame to the next, for readers that jump; FFmpeg's choice if None.
     """
     if width % 2 or height % 2:
         raise InputError(f"expected an even width and height for H.264, got {width} x {height}; pad by one")
@@ -107,7 +114,7 @@ def open_writer(
         # FFmpeg would take some names for the address of a protocol.
         file = stack.enter_context(target.open("wb")) if isinstance(target, Path) else target
         container = stack.enter_context(av.open(file, "w", format="mp4"))
-        stream = _add_stream(container, width, height, rate, fast=fast)
+        stream = _add_stream(container, width, height, rate, fast=fast, key_frame_every=key_frame_every)
         encoder = stack.enter_context(ThreadPoolExecutor(1))
         queue: deque[Future[None]] = deque()
 
@@ -123,12 +130,20 @@ def open_writer(
 
 
 def _add_stream(
-    container: OutputContainer, width: int, height: int, rate: Fraction | int, *, fast: bool
+    container: OutputContainer,
+    width: int,
+    height: int,
+    rate: Fraction | int,
+    *,
+    fast: bool,
+    key_frame_every: int | None,
 ) -> VideoStream:
     """Add an H.264 stream to a file, and return it."""
     stream = container.add_stream("h264", rate=Fraction(rate).limit_denominator(90_000))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     stream.options = {"crf": "20", "preset": "ultrafast" if fast else "veryfast"}
+    if key_frame_every is not None:
+        stream.options |= {"g": str(key_frame_every)}
     if fast:
         stream.thread_count = 1  # its own; more would wait for each other
     return stream

@@ -118,6 +118,14 @@ def write_video(
     lj.write_video("walk.mp4", record, rooms)
     ```
     """
+    write_trace(Path(path), *choose_trace(record, room, robot, index), seconds)
+    return Path(path)
+
+
+def choose_trace(
+    record: Record, room: Room | arena.Arena, robot: closed_loop.Params | None = None, index: int | None = None
+) -> tuple[WalkTrace, arena.Arena, camera.Params]:
+    """Return the walk that `write_video` shows, its room, and the camera of the eyes; arguments as there."""
     batch = jax.tree.map(np.asarray, record if np.ndim(record.time) == 2 else jax.tree.map(lambda x: x[None], record))
     index = selection.select_walk(batch) if index is None else index
     if not -len(batch.time) <= index < len(batch.time):
@@ -126,8 +134,7 @@ def write_video(
     if np.ndim(scene.bounds) == 2:
         scene = jax.tree.map(lambda leaf: leaf[index], scene)
     trace = WalkTrace(*(getattr(batch, name)[index] for name in WalkTrace._fields))
-    write_trace(Path(path), trace, scene, (robot or assembly.load_robot()).camera, seconds)
-    return Path(path)
+    return trace, scene, (robot or assembly.load_robot()).camera
 
 
 def write_trace(

@@ -11,4 +11,5 @@ from . import run_folders as run_folders
 from . import schema as schema
 from . import static_arguments as static_arguments
 from . import storage as storage
+from . import tracking as tracking
 from . import versions as versions

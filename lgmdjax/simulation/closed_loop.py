@@ -29,10 +29,11 @@ from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, controller
 from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
+from lgmdjax.html import Shown
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.sensors import camera, laser
-from lgmdjax.world import arena
+from lgmdjax.world import arena, floor_plan
 
 Tree = TypeVar("Tree")
 AnyArray = Array | np.ndarray
@@ -41,11 +42,12 @@ GradPath = Literal["controller", "body", "everything"]
 """What a gradient passes through: the policy alone, also the body and the label, or also the camera and the LGMDs."""
 
 FRAME_RATE = 30.0  # Hz, of the camera (paper sec. 3.1)
+PATH_STRIDE = 8  # frames between two points of a path that a notebook shows
 SUBSTEPS = 6  # physics steps a frame; the time step in the robot's XML is 1 / (FRAME_RATE * SUBSTEPS)
 
 
 @struct.dataclass(kw_only=True)
-class Params:
+class Params(Shown):
     """Parameters of a robot, beside its body: controller, teacher, and sensors."""
 
     controller: controller.Params
@@ -57,12 +59,15 @@ class Params:
 
 
 @struct.dataclass(kw_only=True)
-class Room:
+class Room(Shown):
     """A room with the poses (x, y, yaw) at which its robot starts, in order."""
 
     arena: arena.Arena
     starts: Float[Array, "starts 3"]
     key: Array  # random key of the policy
+
+    def _picture(self) -> str:
+        return self.arena._picture()
 
 
 @struct.dataclass(kw_only=True)
@@ -81,7 +86,7 @@ class State:
 
 
 @struct.dataclass(kw_only=True)
-class Record:
+class Record(Shown):
     """What is recorded of one frame, or of many: `axes` are then (frame) or (robot, frame).
 
     The pose is that from which the pictures were rendered. Records on the host hold NumPy arrays.
@@ -91,7 +96,7 @@ class Record:
     position: Float[AnyArray, "*axes 3"]  # m, of the trunk
     quaternion: Float[AnyArray, "*axes 4"]  # w x y z
     joints: Float[AnyArray, "*axes 6 3"]  # rad
-    u: Float[AnyArray, "*axes 2"]
+    u: Float[AnyArray, "*axes 2"]  # 1, outputs of the LGMDs, left first
     feed_forward: Float[AnyArray, "*axes 2"]  # grey
     excitation: Float[AnyArray, "*axes 2"]  # grey, U / n_cell
     distances: Float[AnyArray, "*axes 2"]  # m, to the nearest obstacle
@@ -103,6 +108,18 @@ class Record:
     is_first: Bool[AnyArray, "*axes"]  # first frame after a start or reset
     resets: Int[AnyArray, "*axes"]  # number of resets so far
     ok: Bool[AnyArray, "*axes"]  # finite and not fallen
+
+    def _picture(self) -> str:
+        """Return the paths of up to four robots from above, interrupted at resets, with crosses at contacts."""
+        position, resets, contact = (np.asarray(leaf) for leaf in (self.position, self.resets, self.contact))
+        if position.ndim not in (2, 3) or not position.size:
+            return ""
+        series = (leaf if position.ndim == 3 else leaf[None] for leaf in (position, resets, contact))
+        paths, marks = [], []
+        for own, count, touched in zip(*(leaf[:4] for leaf in series), strict=True):
+            paths.append([part[::PATH_STRIDE] for part in np.split(own, np.flatnonzero(np.diff(count)) + 1)])
+            marks.append(own[touched])
+        return floor_plan.svg(None, paths, marks)
 
 
 def assemble(

@@ -21,11 +21,12 @@ MAX_NUMBER = 1e6  # in any unit: far beyond what a robot measures
 
 @dataclass(frozen=True)
 class Field:
-    """Names of the columns that hold one field of `Record`, their unit, and the kind of their numbers."""
+    """Names of the columns that hold one field of `Record`, their unit and meaning, and the kind of their numbers."""
 
     columns: tuple[str, ...]
     unit: str = ""
     kind: str = "f"  # of NumPy's dtype: float, integer, boolean
+    meaning: str = ""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -34,28 +35,52 @@ class Field:
 
 
 FIELDS: Mapping[str, Field] = {
-    "time": Field(("time",), "s"),
-    "position": Field(("x", "y", "z"), "m"),
-    "quaternion": Field(("qw", "qx", "qy", "qz"), "1"),
-    "joints": Field(tuple(f"joint_{j}" for j in range(18)), "rad"),
-    "u": Field(tuple(f"u_{side}" for side in hemifield.SIDES), "1"),
-    "feed_forward": Field(tuple(f"feed_forward_{side}" for side in hemifield.SIDES), "grey"),
-    "excitation": Field(tuple(f"excitation_{side}" for side in hemifield.SIDES), "grey"),
-    "distances": Field(tuple(f"distance_{side}" for side in hemifield.SIDES), "m"),
-    "corridor": Field(tuple(f"corridor_{side}" for side in hemifield.SIDES), "m"),
-    "label": Field(tuple(f"label_{side}" for side in hemifield.SIDES), "0.05 m/s"),
-    "velocity": Field(tuple(f"velocity_{side}" for side in hemifield.SIDES), "0.05 m/s"),
-    "clearance": Field(("clearance",), "m"),
-    "contact": Field(("contact",), kind="b"),
-    "is_first": Field(("is_first",), kind="b"),
-    "resets": Field(("resets",), kind="i"),
-    "ok": Field(("ok",), kind="b"),
+    "time": Field(("time",), "s", meaning="since the start of the walk"),
+    "position": Field(("x", "y", "z"), "m", meaning="of the trunk, from which the pictures were rendered"),
+    "quaternion": Field(("qw", "qx", "qy", "qz"), "1", meaning="attitude of the trunk, w x y z"),
+    "joints": Field(tuple(f"joint_{j}" for j in range(18)), "rad", meaning="coxa, femur, tibia of legs 0 to 5"),
+    "u": Field(tuple(f"u_{side}" for side in hemifield.SIDES), "1", meaning="output of each eye's LGMD, 0.5 to 1"),
+    "feed_forward": Field(
+        tuple(f"feed_forward_{side}" for side in hemifield.SIDES), "grey", meaning="output of the FF cell"
+    ),
+    "excitation": Field(
+        tuple(f"excitation_{side}" for side in hemifield.SIDES),
+        "grey",
+        meaning="mean excitation, before feed-forward inhibition",
+    ),
+    "distances": Field(
+        tuple(f"distance_{side}" for side in hemifield.SIDES), "m", meaning="nearest obstacle in each hemifield"
+    ),
+    "corridor": Field(
+        tuple(f"corridor_{side}" for side in hemifield.SIDES),
+        "m",
+        meaning="nearest obstacle in the way, on either side",
+    ),
+    "label": Field(
+        tuple(f"label_{side}" for side in hemifield.SIDES), "0.05 m/s", meaning="velocity that the teacher commands"
+    ),
+    "velocity": Field(
+        tuple(f"velocity_{side}" for side in hemifield.SIDES), "0.05 m/s", meaning="velocity that the policy commands"
+    ),
+    "clearance": Field(("clearance",), "m", meaning="smallest distance to anything within the frame"),
+    "contact": Field(("contact",), kind="b", meaning="whether the clearance was 0 or less"),
+    "is_first": Field(("is_first",), kind="b", meaning="first frame after a start or reset"),
+    "resets": Field(("resets",), kind="i", meaning="resets so far"),
+    "ok": Field(("ok",), kind="b", meaning="upright and finite"),
 }
 """The columns of each field of `Record`, in its order."""
 
 ORIGIN = {"episode": np.int32, "robot": np.int32, "room": np.int32, "seed": np.int64}
 """The columns that tell which walk a row belongs to."""
 COLUMNS = (*ORIGIN, *(column for field in FIELDS.values() for column in field.columns))
+ORIGIN_MEANINGS = {
+    "episode": "number of the batch of walks",
+    "robot": "number of the robot in its batch",
+    "room": "number of the room",
+    "seed": "seed of the rooms",
+}
+UNITS = {column: field.unit for field in FIELDS.values() for column in field.columns if field.unit}
+MEANINGS = ORIGIN_MEANINGS | {column: field.meaning for field in FIELDS.values() for column in field.columns}
 KINDS = dict.fromkeys(ORIGIN, "i") | {column: field.kind for field in FIELDS.values() for column in field.columns}
 IS_KIND = {
     "f": lambda dtype: pa.types.is_float32(dtype) or pa.types.is_float64(dtype),
@@ -84,6 +109,11 @@ def from_record(record: Record, episode: int, rooms: Sequence[int], seed: int) -
         values = np.reshape(getattr(arrays, name), (robots * frames, len(field.columns)))
         columns |= {column: values[:, k] for k, column in enumerate(field.columns)}
     return pa.table(columns)
+
+
+def pandas_attributes() -> dict[str, str]:
+    """Return the entry of a Parquet file's metadata that pandas reads into `DataFrame.attrs`: units and meanings."""
+    return {"PANDAS_ATTRS": json.dumps({"units": UNITS, "meanings": MEANINGS})}
 
 
 def check(table: pa.Table, path: Path) -> pa.Table:

@@ -122,15 +122,17 @@ class Writer:
         return path
 
     def _metadata(self, table: pa.Table) -> dict[str, str]:
-        units = {column: field.unit for field in FIELDS.values() for column in field.columns if field.unit}
         header = {
             "format": FORMAT,
             "version": VERSION,
-            "units": units,
+            "units": episode_tables.UNITS,
             "parameters": self.parameters,
             "versions": versions.installed(),
         }
-        return {"lgmdjax": json.dumps(header | {checksums.SEAL: episode_tables.digest(table, header)})}
+        return {
+            "lgmdjax": json.dumps(header | {checksums.SEAL: episode_tables.digest(table, header)}),
+            **episode_tables.pandas_attributes(),
+        }
 
 
 def read(folder: Path | str, parameters: JsonObject | None = None) -> list[Walk]:
@@ -157,8 +159,13 @@ def read(folder: Path | str, parameters: JsonObject | None = None) -> list[Walk]
 
 def read_parameters(folder: Path | str) -> JsonObject:
     """Return the parameters of the walks in a folder; empty if there are none."""
+    return read_header(folder).get("parameters", {})
+
+
+def read_header(folder: Path | str) -> JsonObject:
+    """Return the header of the first chunk in a folder: parameters, versions, units; empty if there is none."""
     files = _files(Path(folder))
-    return _load(files[0])[0]["parameters"] if files else {}
+    return _load(files[0])[0] if files else {}
 
 
 def stack_walks(walks: Sequence[Walk]) -> Record:

@@ -50,7 +50,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import controller, policies
@@ -60,7 +60,7 @@ from lgmdjax.learning import dagger, finetuning, rollout_gradient
 from lgmdjax.learning.checkpoints import Checkpoints
 from lgmdjax.locomotion import cpg
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import storage, tracking
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, recording, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, GradPath, Params, Record, Room
@@ -173,7 +173,7 @@ def finetune_learner(
 
         after, stats = finetuning.finetune(
             robot, hexapod.build(), partial(_rooms, seed, training.robots), window, finetune_settings,
-            checkpoints=checkpoints, on_window=on_window,
+            checkpoints=checkpoints, on_window=on_window, label=tracking.name_fit(folder),
         )  # fmt: skip
     columns = zip(finetuning.WindowStats._fields, zip(*stats, strict=True), strict=True)
     curve = {name: list(column) for name, column in columns}

@@ -38,7 +38,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, PyTree
 from matplotlib.figure import Figure
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.body import hexapod
 from lgmdjax.evaluation import gait_test
@@ -46,7 +46,7 @@ from lgmdjax.learning import gait_objective
 from lgmdjax.learning.gait_objective import GaitParams, GaitState, GaitSummary
 from lgmdjax.locomotion import shaping, tripod_gait
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime import storage
+from lgmdjax.runtime import storage, tracking
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, sharding
@@ -168,6 +168,7 @@ def fit(
             scaled, opt_state, tasks, initial, jax.random.fold_in(key, number)
         )
         curve.append([optimisation.robot_seconds * (number + 1), float(value)])
+        tracking.log(number + 1, {f"{optimisation.label}, seed {seed}/loss": curve[-1][1]})
     return jax.tree.map(jnp.multiply, scaled, optimisation.param_scales), curve, time.monotonic() - clock
 
 

@@ -44,7 +44,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from lgmdjax.control import navigator
 from lgmdjax.detectors import lgmd

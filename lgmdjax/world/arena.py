@@ -22,18 +22,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from lgmdjax.errors import InputError
+from lgmdjax.html import Shown
+from lgmdjax.world import floor_plan
 from lgmdjax.world.obstacles import (
     CAPACITY,
     INACTIVE_POSITION,
+    ROBOT_HEIGHT,
     Prisms,
     distance_to_boxes,
     distance_to_cylinders,
     inactive,
     is_inactive,
+    is_overhead,
     make_prisms,
     mirror_prisms,
     move_prisms,
@@ -60,12 +64,11 @@ __all__ = [
     "validate",
 ]
 
-ROBOT_HEIGHT = 0.35
-"""Upper bound of the height of every part of the robot [m]. Obstacles that begin above it are overhead."""
+PICTURES = 4  # of a batch of rooms, that notebooks show
 
 
 @struct.dataclass(kw_only=True)
-class Arena:
+class Arena(Shown):
     """A room: obstacles, four walls that are visible from inside, a floor, and a uniform sky (or ceiling)."""
 
     boxes: Prisms
@@ -83,6 +86,12 @@ class Arena:
     """A free start pose: x, y, yaw [m, m, rad]."""
     handedness: Float[Array, ""]
     """1, or -1 in a mirrored room. Textures use h y in place of y, so that their patterns are mirrored too."""
+
+    def _picture(self) -> str:
+        if np.ndim(self.bounds) == 1:
+            return floor_plan.svg(self)
+        arenas = (jax.tree.map(lambda leaf, k=k: leaf[k], self) for k in range(min(len(self.bounds), PICTURES)))
+        return "".join(floor_plan.svg(arena) for arena in arenas)
 
 
 def empty_room(
@@ -191,11 +200,6 @@ def _distances(arena: Arena, p: Float[Array, "s 2"], q: Float[Array, "s 2"]) -> 
     boxes = jnp.where(is_overhead(arena.boxes), jnp.inf, distance_to_boxes(arena.boxes, p, q))
     cylinders = jnp.where(is_overhead(arena.cylinders), jnp.inf, distance_to_cylinders(arena.cylinders, p, q))
     return jnp.concatenate([boxes, cylinders, jnp.minimum(p, q) - low, high - jnp.maximum(p, q)], axis=-1)
-
-
-def is_overhead(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
-    """Return which prisms begin above the robot."""
-    return prisms.bottom >= ROBOT_HEIGHT
 
 
 def pose_clearances(arena: Arena, poses: Float[Array, "n 3"], ahead: float = 0.3) -> Float[Array, " n"]:

@@ -34,6 +34,8 @@ INACTIVE_POSITION = 1.0e3
 TEXTURE_COLUMNS = ("brightness", "contrast", "phase", "scale")
 """Columns of a texture row: mean grey level 0..255, contrast 0..1, phase [rad], longest wavelength [m]."""
 PLAIN_TEXTURE = (128.0, 0.0, 0.0, 0.5)
+ROBOT_HEIGHT = 0.35
+"""Upper bound of the height of every part of the robot [m]. Obstacles that begin above it are overhead."""
 
 
 @struct.dataclass(kw_only=True)
@@ -52,6 +54,11 @@ class Prisms:
     goal: Float[Array, "n 2"]  # m
     departs: Float[Array, " n"]  # s
     arrives: Float[Array, " n"]
+
+
+def is_overhead(prisms: Prisms) -> Bool[Array | np.ndarray, "*rooms n"]:
+    """Return which prisms begin above the robot."""
+    return prisms.bottom >= ROBOT_HEIGHT
 
 
 def make_prisms(

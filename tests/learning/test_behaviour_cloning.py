@@ -12,6 +12,7 @@ from lgmdjax.control import names, navigator
 from lgmdjax.errors import InputError
 from lgmdjax.learning import behaviour_cloning, sequences
 from lgmdjax.learning.checkpoints import Checkpoints
+from lgmdjax.runtime import tracking
 from lgmdjax.simulation import sharding
 from lgmdjax.simulation.episodes import Walk
 
@@ -77,7 +78,10 @@ def test_an_epoch_equals_rmsprop_by_hand():
     walks = [walk(1, 7), walk(2, 5)]
     chosen = settings(epochs=1, window=4, streams=1)
     params = navigator.create(jax.random.key(1))
-    fitted = behaviour_cloning.fit(params, walks, [walk(3, 9)], chosen, show_progress=False)
+    logged = []
+    with tracking.listening(lambda step, values: logged.append((step, values))):
+        fitted = behaviour_cloning.fit(params, walks, [walk(3, 9)], chosen, show_progress=False)
+    assert logged == [(1, {"lstm/train_mse": fitted.train_mse[0], "lstm/test_mse": fitted.test_mse[0]})]
     start = behaviour_cloning.standardise(params, walks, mirrored=False)
     u, label = (np.concatenate([getattr(w, name) for w in walks]) for name in ("u", "label"))
 
@@ -212,7 +216,12 @@ def test_an_interrupted_fit_gives_the_same_result(data, tmp_path, monkeypatch):
         patch.setattr(Checkpoints, "save", interrupted)
         with pytest.raises(KeyboardInterrupt):
             behaviour_cloning.fit(params, train, test, chosen, checkpoints=tmp_path / "fit", show_progress=False)
-    resumed = behaviour_cloning.fit(params, train, test, chosen, checkpoints=tmp_path / "fit", show_progress=False)
+    logged = {}
+    with tracking.listening(lambda step, values: logged.update({step: values})):
+        resumed = behaviour_cloning.fit(params, train, test, chosen, checkpoints=tmp_path / "fit", show_progress=False)
+    assert list(logged) == list(range(3, EPOCHS + 1))  # the epochs that were not yet saved
+    curve = [value for values in logged.values() for name, value in values.items() if name.endswith("fit/test_mse")]
+    np.testing.assert_array_equal(curve, resumed.test_mse[2:])
     assert saved == [1, 2, 3]
     assert same(vars(resumed), vars(uninterrupted))
     finished = behaviour_cloning.fit(params, train, test, chosen, checkpoints=tmp_path / "fit", show_progress=False)

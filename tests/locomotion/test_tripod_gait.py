@@ -7,6 +7,7 @@ import pytest
 
 from lgmdjax.body import hexapod
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
+from lgmdjax.runtime import tracking
 
 TRIPODS = np.array([0.0, 0.5, 0.0, 0.5, 0.0, 0.5])
 VELOCITIES = np.linspace(shaping.MIN_VELOCITY, shaping.MAX_VELOCITY, 7)
@@ -26,7 +27,10 @@ def geometry(body):
 def fitted(geometry):
     """Fit networks in 300 steps, a twentieth of those of the pretrained networks; return them and the losses."""
     losses = []
-    networks = gait_fit.fit(geometry, steps=300, candidates=6, progress=lambda *progress: losses.append(progress))
+    logged = []
+    with tracking.listening(lambda step, values: logged.append((step, values["shaping/loss_mm2"]))):
+        networks = gait_fit.fit(geometry, steps=300, candidates=6, progress=lambda *progress: losses.append(progress))
+    assert logged == losses
     return networks, losses
 
 

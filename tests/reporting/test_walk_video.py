@@ -1,6 +1,8 @@
 """The video of a walk and the third-person view: positions of robot and eyes, visibility, and the file."""
 
+import base64
 import io
+import re
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
@@ -14,7 +16,7 @@ import pytest
 import synthetic
 
 from lgmdjax.errors import InputError
-from lgmdjax.reporting import third_person, walk_video
+from lgmdjax.reporting import inline_video, third_person, walk_video
 from lgmdjax.sensors import camera
 from lgmdjax.simulation import assembly
 from lgmdjax.simulation.closed_loop import Room
@@ -197,5 +199,12 @@ def test_a_video_of_a_record_shows_one_walk_in_its_own_room(monkeypatch: pytest.
     assert eyes == robot.camera and seconds == 3.0
     for name, series in first._asdict().items():
         np.testing.assert_array_equal(series, getattr(single, name))
+    monkeypatch.setattr(
+        walk_video, "write_trace", lambda target, *arguments: target.write(repr(arguments[-1]).encode())
+    )
+    shown = inline_video.show_walk(record, rooms, robot, index=1, seconds=7.5)
+    assert shown.data == b"7.5" and shown.save(tmp_path / "shown.mp4").read_bytes() == b"7.5"
+    source = re.search(r'<video controls .*src="data:video/mp4;base64,(.*)"></video>', shown._repr_html_())
+    assert source is not None and base64.b64decode(source[1]) == b"7.5"
     with pytest.raises(InputError, match="expected an index of one of 2 walks, got 2"):
         walk_video.write_video(tmp_path / "walk.mp4", record, rooms, robot, index=2)

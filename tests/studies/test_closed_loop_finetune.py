@@ -19,6 +19,7 @@ from lgmdjax.learning.settings import TrainSettings
 from lgmdjax.locomotion import shaping
 from lgmdjax.pipeline import scales
 from lgmdjax.reporting.figures import style
+from lgmdjax.runtime import tracking
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, recording, room_batches
@@ -133,7 +134,7 @@ def finetuned(monkeypatch):
         learner = navigator.create(jax.random.key(seed), symmetric=True)
         return replace(learner, output_mean=jnp.full(2, float(sum(walks)))), []
 
-    def finetune(params, model, sample_rooms, gradient_settings, settings, *, checkpoints, on_window):
+    def finetune(params, model, sample_rooms, gradient_settings, settings, *, checkpoints, on_window, label):
         calls.append((params.controller, gradient_settings, settings))
         stats = finetuning.WindowStats(
             loss=0.5, signal=2.0, noise=1.0, median_norm=1.0, max_norm=3.0, nonfinite=0, fallen=0, contacts=0
@@ -163,6 +164,22 @@ def test_all_learners_train_for_the_same_time_and_have_a_row(finetuned, tmp_path
     for (name, _), seconds in curves.items():
         assert seconds[-1] == pytest.approx(time / 2 if name == "dagger + everything" else time)
     assert (folder / "closed_loop_finetune.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_every_window_of_a_fit_is_logged(params, monkeypatch):
+    """Two rooms of three windows, whose gradient is a stand-in."""
+    found = rollout_gradient.Gradient(
+        loss=jnp.asarray(0.25), grad=jax.tree.map(jnp.zeros_like, params), norms=jnp.ones(2),
+        standard_error=jnp.asarray(0.5), nonfinite=jnp.zeros(2, bool),
+    )  # fmt: skip
+    monkeypatch.setattr(finetuning.rollout, "reset_batch", lambda *_, **__: None)
+    gradient = lambda *_, **__: (found, None, synthetic.walk(2, 3))  # noqa: E731
+    monkeypatch.setattr(rollout_gradient, "gradient", gradient)
+    robot, logged = replace(assembly.load_robot(), controller=params), []
+    settings = finetuning.Settings(rooms=2, windows_per_room=3)
+    with tracking.listening(lambda step, values: logged.append((step, values["joint/loss"], values["joint/noise"]))):
+        finetuning.finetune(robot, None, lambda _: None, rollout_gradient.Settings(), settings, label="joint")
+    assert logged == [(window, 0.25, 0.5) for window in range(1, 7)]
 
 
 def test_learners_start_from_their_navigator_with_smooth_thresholds_and_equal_total_rate(finetuned, tmp_path):

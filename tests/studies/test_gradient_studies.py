@@ -15,6 +15,7 @@ from lgmdjax.evaluation import gait_test
 from lgmdjax.learning import gait_objective
 from lgmdjax.locomotion import shaping
 from lgmdjax.paths import PRETRAINED_DIR
+from lgmdjax.runtime import tracking
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches
 from lgmdjax.studies import gait_gradient, gradient_horizon
@@ -54,7 +55,9 @@ def initial_coupling(monkeypatch):
 
 def test_both_methods_fit_the_gait_for_the_same_simulated_time(initial_coupling, tmp_path):
     """The sway is least at a coupling 5 % above the initial one; the gradient leaves all other parameters unchanged."""
-    gait_gradient.run(tmp_path, INPUTS, SETTINGS, seed=0)
+    logged: dict[str, list[float]] = {}
+    with tracking.listening(lambda _, values: [logged.setdefault(k, []).append(v) for k, v in values.items()]):
+        gait_gradient.run(tmp_path, INPUTS, SETTINGS, seed=0)
     rows = json.loads((tmp_path / "gait_gradient.json").read_text())
     assert [(row["method"], row["repeat"]) for row in rows] == [
         ("initial", 0), ("gradient", 0), ("gradient", 1), ("evolution", 0), ("evolution", 1)
@@ -62,6 +65,7 @@ def test_both_methods_fit_the_gait_for_the_same_simulated_time(initial_coupling,
     weight = gait_gradient.SWAY_WEIGHT / (LEAST + BEST - 1) ** 2
     for row in rows[1:]:
         time, losses = np.array(row["curve"]).T
+        assert logged[f"{row['method']}, seed {row['repeat']}/loss"] == losses.tolist()
         rollouts = {"gradient": 1, "evolution": 2 * SETTINGS.pairs}[row["method"]]
         step = len(gait_gradient.COMMANDS) * gait_gradient.ROBOTS_PER_COMMAND * SETTINGS.window * rollouts
         np.testing.assert_allclose(time, step * np.arange(1, len(time) + 1))

@@ -20,6 +20,7 @@ from lgmdjax.learning import behaviour_cloning, dagger, lgmd_gradient_fit
 from lgmdjax.learning.settings import LgmdGradientSettings
 from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.reporting.figures import style
+from lgmdjax.runtime import tracking
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, episodes, room_batches
 from lgmdjax.studies import lgmd_gradient
@@ -121,7 +122,10 @@ def test_a_fit_approaches_the_detector_of_the_labels(params, data):
     """Measured with hard thresholds, on test walks."""
     test = data[1]
     evaluate = lambda params: {"choice": lgmd_gradient.score(params, *test)["mse"]}  # noqa: E731
-    fitted, rows = lgmd_gradient_fit.fit(params, batch_of(data), ("detector",), SETTINGS, evaluate)
+    logged = []
+    with tracking.listening(lambda step, values: logged.append((step, values["fit/choice"], values.get("fit/loss")))):
+        fitted, rows = lgmd_gradient_fit.fit(params, batch_of(data), ("detector",), SETTINGS, evaluate)
+    assert logged == [(row["step"], row["choice"], row["loss"]) for row in rows]
     assert [row["step"] for row in rows] == [0, 30, 60, 90, 120]
     least = min(row["choice"] for row in rows)
     assert least < 0.2 * rows[0]["choice"] and evaluate(fitted)["choice"] == pytest.approx(least)

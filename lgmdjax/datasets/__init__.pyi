@@ -1,0 +1,10 @@
+from . import card as card
+from . import exporter as exporter
+from . import formats as formats
+from . import lerobot as lerobot
+from . import lerobot_features as lerobot_features
+from . import pictures as pictures
+from . import recorded as recorded
+from . import statistics as statistics
+from . import tables as tables
+from . import zarr_arrays as zarr_arrays

@@ -1,0 +1,127 @@
+"""Both eyes' whole pictures of recorded walks, rendered again from the poses, in grey levels of 8 bits.
+
+Recorded walks hold no pictures, but what they were recorded with gives their rooms and their camera. That these are the
+right ones is checked: the detector has to give the recorded u of the first `CHECKED_FRAMES` of each walk.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, UInt8
+
+from lgmdjax.datasets.recorded import Recording
+from lgmdjax.detectors import lgmd
+from lgmdjax.errors import InputError
+from lgmdjax.evaluation import trials
+from lgmdjax.learning import dagger
+from lgmdjax.sensors import hemifield
+from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.simulation import assembly, episodes, rerender, room_batches
+from lgmdjax.simulation.assembly import CALIBRATED
+from lgmdjax.simulation.episodes import Walk
+from lgmdjax.world.arena import Arena
+
+CHECKED_FRAMES = 3 * rerender.FRAMES_PER_CALL  # rendered at once, too
+SETTLING_FRAMES = 2  # not compared: a walk may begin with frames that the detector compares with earlier ones
+TOLERANCE = 0.02  # largest RMS difference of u, in standard deviations of the recorded u
+
+Pictures = UInt8[np.ndarray, "frames 2 height width"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eyes:
+    """The camera that recorded walks were recorded with, and the LGMD behind it."""
+
+    settings: CameraSettings
+    detector: lgmd.Params
+
+
+def find_eyes(recording: Recording) -> Eyes:
+    """Return the eyes of a recording: those in its header, or of the run that it is in, or of the pretrained robot."""
+    parameters = recording.parameters
+    if "eyes" in parameters and "lgmd" in parameters:
+        settings = CameraSettings(**parameters["eyes"])
+        constants = {name: float(parameters["lgmd"][name]) for name in CALIBRATED}
+        return Eyes(settings=settings, detector=assembly.fit_detector(lgmd.Params(**constants), settings))
+    around = [folder for folder in recording.folder.resolve().parents if (folder / "train").is_dir()]
+    runs = [folder for folder in around if (folder / "train" / "controller.safetensors").is_file()]
+    robot = assembly.load_robot(runs[0] / "fit-gait", runs[0] / "train") if runs else assembly.load_robot()
+    return Eyes(settings=assembly.camera_settings(robot), detector=robot.controller.lgmd)
+
+
+def find_rooms(recording: Recording) -> list[Arena]:
+    """Return the room of each walk, made again from seeds; raise `InputError` if the header does not tell how."""
+    parameters, walks = recording.parameters, recording.walks
+    if "trial" in parameters:
+        rooms = trials.sample_rooms(parameters["trial"], parameters["seeds"], walks[0].seed).arena
+        return [_pick(rooms, walk.room) for walk in walks]
+    if "round" in parameters:
+        episode = dagger.FIRST_LEARNER_EPISODE + parameters["round"]
+        rooms = room_batches.training_rooms(walks[0].seed, episode, len(walks)).arena
+        return [_pick(rooms, walk.room) for walk in walks]
+    if "robots" in parameters:
+        count = parameters["robots"]
+        batches = {
+            episode: room_batches.training_rooms(seed, episode, count).arena
+            for episode, seed in {walk.episode: walk.seed for walk in walks}.items()
+        }
+        return [_pick(batches[walk.episode], walk.room % count) for walk in walks]
+    raise InputError(
+        f"expected walks of collect, of a round of DAgger or of a trial for --video, got {recording.folder} recorded "
+        f"with {', '.join(parameters) or 'nothing'}; leave --video out"
+    )
+
+
+def render(eyes: Eyes, room: Arena, walk: Walk) -> Iterator[Pictures]:
+    """Yield the pictures of a walk, some seconds at a time; raise `InputError` if they don't give the recorded u."""
+    whole = replace(assembly.camera_params(eyes.settings), overlap=1.0, ground=0.0)
+    rooms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], room)
+    for first in range(0, len(walk), CHECKED_FRAMES):
+        part = walk[first : first + CHECKED_FRAMES]
+        pictures = rerender.render_walks(whole, rooms, episodes.stack_walks([part]))[0]
+        if first == 0:
+            _check(eyes, part, pictures)
+        yield np.rint(np.clip(pictures, 0, 255)).astype(np.uint8)
+
+
+def _check(eyes: Eyes, walk: Walk, pictures: Float[np.ndarray, "frames 2 height width"]) -> None:
+    """Raise `InputError` unless the detector gives the recorded u; u of a policy without camera is constant."""
+    if len(walk) <= SETTLING_FRAMES or np.ptp(walk.u) == 0:
+        return
+    field = {"overlap": eyes.settings.overlap, "ground": eyes.settings.ground}
+    seen = np.stack([hemifield.crop(pictures[:, side], side, **field) for side in range(2)], axis=1)
+    padding = [(0, CHECKED_FRAMES - len(walk)), *[(0, 0)] * 3]  # one program serves all lengths
+    is_first = np.pad(walk.is_first | (np.arange(len(walk)) == 0), padding[0])
+    u = np.asarray(respond(eyes.detector, jnp.asarray(np.pad(seen, padding)), jnp.asarray(is_first)))[: len(walk)]
+    known = walk.ok & (np.arange(len(walk)) >= SETTLING_FRAMES)
+    difference = np.sqrt(np.mean((u - walk.u)[known] ** 2)) / max(float(walk.u[known].std()), 1e-6)
+    if not difference <= TOLERANCE:
+        raise InputError(
+            f"expected pictures that give the recorded u within {TOLERANCE} standard deviations, got {difference:.2g} "
+            f"in robot {walk.robot}'s walk of episode {walk.episode}; use the version that recorded it, or leave "
+            "--video out"
+        )
+
+
+@jax.jit
+def respond(
+    detector: lgmd.Params, pictures: Float[Array, "frames 2 rows columns"], is_first: Bool[Array, " frames"]
+) -> Float[Array, "frames 2"]:
+    """Return u of both eyes' LGMDs for pictures of their hemifields; each first frame starts them anew."""
+
+    def frame(state: lgmd.State, inputs: tuple[Array, Array]) -> tuple[lgmd.State, Array]:
+        images = hemifield.outermost_first(inputs[0])
+        state = jax.tree.map(partial(jnp.where, inputs[1]), jax.vmap(partial(lgmd.init, detector))(images), state)
+        state, response = jax.vmap(partial(lgmd.step, detector))(state, images)
+        return state, response.u
+
+    start = jax.vmap(partial(lgmd.init, detector))(pictures[0])
+    return jax.lax.scan(frame, start, (pictures, is_first))[1]
+
+
+def _pick(rooms: Arena, index: int) -> Arena:
+    return jax.tree.map(lambda leaf: leaf[index], rooms)
