@@ -1,4 +1,5 @@
 from . import bench as bench
+from . import bench_clips as bench_clips
 from . import doctor as doctor
 from . import environment as environment
 from . import export as export

@@ -125,8 +125,10 @@ class WatchFlags:
 class BenchFlags:
     """What detectors are compared on, and which."""
 
-    on: tyro.conf.Positional[Literal["stimuli"]]
-    """stimuli: laboratory stimuli, from approach to a flash of light"""
+    on: tyro.conf.Positional[Literal["stimuli", "clips"]]
+    """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos"""
+    paths: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """with clips, the folder of the videos, and the file of their labels if it is not labels.csv in that folder"""
     detector: tuple[str, ...] = ("all",)
     """detectors by name, or module:attribute for one of your own; all stands for those of lgmdjax.detectors"""
     scale: BenchScale = "quick"

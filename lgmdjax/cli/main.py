@@ -109,14 +109,15 @@ def export(arguments: Sequence[str]) -> None:
 
 
 def bench(arguments: Sequence[str]) -> None:
-    """Compare looming detectors on laboratory stimuli: table, JSON, figure."""
+    """Compare looming detectors on laboratory stimuli or labelled videos: table, JSON, figure, page."""
     from lgmdjax.cli import flags
 
     given = flags.parse_bench(_summary(bench), arguments)
     environment.start_jax()
     from lgmdjax.cli.bench import run_bench
+    from lgmdjax.cli.bench_clips import run_clips
 
-    for line in run_bench(given):
+    for line in run_clips(given) if given.on == "clips" else run_bench(given):
         print(line, flush=True)
 
 

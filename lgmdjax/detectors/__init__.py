@@ -11,6 +11,7 @@
 | grm            | Chalupka et al. 2016: generalised regressive motion                        |
 | lplc2          | fruit fly, Klapoetke et al. 2017 and Zhou et al. 2022: outward motion      |
 | eta, tau       | ideal observers that are told the geometry: Gabbiani et al. 1999, Lee 1976 |
+| alarm          | a scale that adapts to the scene, threshold and persistence, for any of them |
 | cells, on_off  | what several of them share                                                 |
 """
 

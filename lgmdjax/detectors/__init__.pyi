@@ -1,3 +1,4 @@
+from . import alarm as alarm
 from . import cells as cells
 from . import d_lgmd as d_lgmd
 from . import emd as emd

@@ -1,3 +1,4 @@
+from . import clip_page as clip_page
 from . import figures as figures
 from . import lgmd_overlay as lgmd_overlay
 from . import selection as selection
