@@ -52,7 +52,9 @@ def write_video(path: Path) -> Path:
 def run_watch(path: Path, out: Path, overlay: bool) -> None:
     """Run the command's work without its progress bar."""
     with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
-        watch.detect_looming(path, out, layout=watch.StereoLayout(), params=lgmd.Params(), overlay=overlay)
+        watch.detect_looming(
+            path, out, layout=watch.StereoLayout(), params=watch.Detectors(lgmd.Params()), overlay=overlay
+        )
 
 
 def run_by_hand(path: Path, target: Path | None) -> None:

@@ -8,3 +8,4 @@ from . import main as main
 from . import study as study
 from . import trial as trial
 from . import watch as watch
+from . import watch_files as watch_files

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.csv
 from tqdm import tqdm
 
-from lgmdjax.cli.flags import BenchFlags
+from lgmdjax.cli.flags import AlarmFlags, BenchFlags
 from lgmdjax.detectors import alarm
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import clip_labels, clip_responses, clip_scores, stimulus_scores
@@ -32,7 +32,7 @@ from lgmdjax.runtime import storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
 SCALES = {"own": "u", "adapted": "adapted"}  # name in scores.json, and in `Trace`
-FIXED = clip_scores.Setting(alarm.Params.threshold, alarm.Params.persistence)  # that of `lgmdjax watch`
+FIXED = clip_scores.Setting(AlarmFlags.threshold, AlarmFlags.persistence)  # those of `lgmdjax watch`
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 COLUMNS = ("detector", "AUC u", "AUC adapted", "peak at contact", "hits", "false alarms / min", "lead [s]", "halves")
 Traces = Mapping[str, Sequence[Trace]]
@@ -166,7 +166,7 @@ def _page(clips: Sequence[Clip], rows: Sequence[JsonObject], traces: Traces) -> 
             "approaches": sum(label.is_approach for label in labels),
             "contacts": sum(label.contact is not None for label in labels),
             "cells": (clip_responses.WIDTH, clip_responses.HEIGHT),
-            "alarm": alarm.Params(),
+            "alarm": alarm.Params(threshold=FIXED.threshold, persistence=FIXED.persistence),
             "window": clip_scores.WINDOW,
             "tolerance": clip_scores.PEAK_TOLERANCE,
             "rows": rows,

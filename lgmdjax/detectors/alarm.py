@@ -40,6 +40,7 @@ from lgmdjax.detectors.cells import Cells, Scalar, pool
 from lgmdjax.errors import InputError
 
 BLOCKS = 16  # in a row of the frame, whose changes are compared
+GAP = 0.5  # s, between two alarms below which people count them as one
 STILL = 1e-3  # grey, mean change below which nothing has moved
 
 
@@ -49,7 +50,7 @@ class Params:
 
     fast: Scalar = 0.3  # s
     slow: Scalar = 3.0  # s
-    threshold: Scalar = 2 / 3  # of A: twice the mean of the last seconds
+    threshold: Scalar = 0.6  # of A: half as much again as in the last seconds
     persistence: Scalar = 0.1  # s
     frame_time: Scalar = 1 / 30  # dt, s
 
@@ -102,7 +103,7 @@ def check(params: Params) -> None:
     if not 0.5 < float(params.threshold) < 1:
         raise InputError(
             f"alarm threshold: expected more than 0.5 (no rise) and less than 1, got {params.threshold}; "
-            "0.667 is twice the mean of the last seconds"
+            "0.6 is half as much again as in the last seconds"
         )
     if not 0 <= float(params.persistence) <= 10:
         raise InputError(f"alarm persistence: expected 0 to 10 s, got {params.persistence}; 0.1 is usual")

@@ -1,12 +1,12 @@
 """Scores of an alarm on labelled clips: hits, false alarms, lead time, and area under ROC.
 
-An alarm is a response that stays above a threshold for some time. It is scored by its beginnings:
+An alarm is a response that stays above a threshold for some time; gaps of up to 0.5 s do not end it.
 
 | word        | meaning                                                                                              |
 | ----------- | ---------------------------------------------------------------------------------------------------- |
 | window      | from 1.5 s before contact to 0.1 s after it, which is how exact labels are                           |
-| hit         | an alarm begins in the window; without a time of contact, anywhere in a clip that approaches         |
-| lead        | time from the first beginning in the window to contact [s]                                           |
+| hit         | there is an alarm in the window; without a time of contact, anywhere in a clip that approaches       |
+| lead        | time from the first alarm in the window to contact [s], at most 1.5                                  |
 | false alarm | an alarm begins before the window, or anywhere in a clip that does not approach                      |
 | minutes     | time before the windows, and of clips that do not approach; what follows contact does not count      |
 | stretch     | about 1.5 s of those minutes                                                                         |
@@ -61,7 +61,7 @@ class Counts(NamedTuple):
     hits: Bool[np.ndarray, "persistences thresholds"]
     leads: Float[np.ndarray, "persistences thresholds"]  # s; nan without a hit or a time of contact
     false_alarms: Float[np.ndarray, "persistences thresholds"]
-    alarmed: Float[np.ndarray, "persistences thresholds"]  # stretches in which an alarm begins
+    alarmed: Float[np.ndarray, "persistences thresholds"]  # stretches in which there is an alarm
     stretches: int
     minutes: float
     is_approach: bool
@@ -120,8 +120,8 @@ def score_fixed(series: Sequence[Series], setting: Setting) -> JsonObject:
 
 def begin(series: Series, setting: Setting) -> list[float]:
     """Return when the alarms begin [s]."""
-    onsets = _onsets(series, np.asarray([setting.threshold]), setting.persistence)[:, 0]
-    return series.time[onsets].tolist()
+    is_on = _alarmed(series, np.asarray([setting.threshold]), setting.persistence)
+    return series.time[_onsets(is_on, series.rate)[:, 0]].tolist()
 
 
 def window(label: Label) -> tuple[float, float]:
@@ -137,36 +137,41 @@ def count(series: Series, thresholds: Float[np.ndarray, " thresholds"], persiste
     in_window = (series.time >= low) & (series.time <= high)
     before = series.time < low
     stretches = _stretches(series)
-    onsets = [_onsets(series, thresholds, persistence) for persistence in persistences]
+    is_on = [_alarmed(series, thresholds, persistence) for persistence in persistences]
+    first = [_first_time(series.time, each & in_window[:, None]) for each in is_on]
     contact = np.inf if series.label.contact is None else series.label.contact
-    first = [_first_time(series.time, each & in_window[:, None]) for each in onsets]
+    leads = [np.where(np.isfinite(each) & np.isfinite(contact), contact - each, np.nan) for each in first]
+    none = np.zeros(len(thresholds))
     return Counts(
-        hits=np.asarray([np.isfinite(each) for each in first]),
-        leads=np.asarray(
-            [np.where(np.isfinite(each) & np.isfinite(contact), contact - each, np.nan) for each in first]
-        ),
-        false_alarms=np.asarray([(each & before[:, None]).sum(axis=0) for each in onsets], float),
-        alarmed=np.asarray(
-            [sum((each[part].any(axis=0) for part in stretches), np.zeros(len(thresholds))) for each in onsets]
-        ),
+        hits=np.isfinite(first),
+        leads=np.asarray(leads),
+        false_alarms=np.asarray([(_onsets(each, series.rate) & before[:, None]).sum(axis=0) for each in is_on], float),
+        alarmed=np.asarray([sum((each[part].any(axis=0) for part in stretches), none) for each in is_on]),
         stretches=len(stretches),
         minutes=float(before.sum()) / series.rate / 60,
         is_approach=series.label.is_approach,
     )
 
 
-def _first_time(time: np.ndarray, is_onset: np.ndarray) -> np.ndarray:
-    """Return the time of the first onset for each threshold; nan without."""
-    return np.where(is_onset.any(axis=0), time[is_onset.argmax(axis=0)], np.nan)
+def _first_time(time: np.ndarray, is_on: np.ndarray) -> np.ndarray:
+    """Return the time of the first frame with an alarm for each threshold; nan without."""
+    return np.where(is_on.any(axis=0), time[is_on.argmax(axis=0)], np.nan)
 
 
-def _onsets(series: Series, thresholds: np.ndarray, persistence: float) -> Bool[np.ndarray, "frames thresholds"]:
-    """Return the frames in which an alarm begins, which has to last: the last of those that it needs."""
+def _alarmed(series: Series, thresholds: np.ndarray, persistence: float) -> Bool[np.ndarray, "frames thresholds"]:
+    """Return the frames with an alarm: from the last of the frames on that it needs."""
     frames = alarm.required_frames(persistence, 1 / series.rate)
     padded = np.concatenate([np.full(frames - 1, -np.inf), series.response])
     lasting = np.lib.stride_tricks.sliding_window_view(padded, frames).min(axis=1)
-    is_on = lasting[:, None] >= thresholds
-    return is_on & ~np.concatenate([np.zeros((1, len(thresholds)), bool), is_on[:-1]])
+    return lasting[:, None] >= thresholds
+
+
+def _onsets(is_on: Bool[np.ndarray, "frames thresholds"], rate: float) -> Bool[np.ndarray, "frames thresholds"]:
+    """Return the frames in which an alarm begins, after a gap of more than `alarm.GAP` or at the beginning."""
+    index = np.arange(len(is_on))[:, None]
+    last = np.maximum.accumulate(np.where(is_on, index, -len(is_on) - rate), axis=0)
+    before = np.concatenate([np.full((1, is_on.shape[1]), -len(is_on) - rate), last[:-1]])
+    return is_on & (index - before > alarm.GAP * rate + 1)
 
 
 def _stretches(series: Series) -> list[np.ndarray]:
@@ -248,16 +253,9 @@ def peak_is_at_contact(series: Series) -> bool:
 
 
 def roc(counts: Sequence[Counts], persistence: int) -> JsonObject:
-    """Return hit rate and false alarms a minute for every threshold, at one persistence."""
+    """Return hit rate and share of stretches with a false alarm for every threshold, at one persistence."""
     approaches = sum(each.is_approach for each in counts)
-    minutes = sum(each.minutes for each in counts)
+    stretches = max(sum(each.stretches for each in counts), 1)
     hits = np.sum([each.hits[persistence] & each.is_approach for each in counts], axis=0)
-    false_alarms = np.sum([each.false_alarms[persistence] for each in counts], axis=0)
-    return {
-        "hit_rate": (hits / approaches).tolist(),
-        "false_alarms_a_minute": (false_alarms / minutes).tolist() if minutes else [],
-        "share_of_stretches": (
-            np.sum([each.alarmed[persistence] for each in counts], axis=0)
-            / max(sum(each.stretches for each in counts), 1)
-        ).tolist(),
-    }
+    alarmed = np.sum([each.alarmed[persistence] for each in counts], axis=0)
+    return {"hit_rate": (hits / approaches).tolist(), "stretches_with_alarm": (alarmed / stretches).tolist()}

@@ -12,7 +12,7 @@ def weighted_mean(values, moved, tau, dt=1 / 30):
     return float(np.sum(weights * seen) / np.sum(weights))
 
 
-def alarm(frames, excitation, fast=0.3, slow=3.0, threshold=2 / 3, persistence=0.1, dt=1 / 30, block=1):
+def alarm(frames, excitation, fast=0.3, slow=3.0, threshold=0.6, persistence=0.1, dt=1 / 30, block=1):
     """Return A, w and the alarm for each frame after the first; frames are multiples of a block."""
     n, height, width = frames.shape
     blocks = frames.reshape(n, height // block, block, width // block, block).mean((2, 4))

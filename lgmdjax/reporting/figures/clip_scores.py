@@ -12,8 +12,7 @@ from lgmdjax.runtime.storage import JsonObject
 
 COLOURS = (*style.PALETTE, style.DARK, style.GREY, style.RED, "#8c564b")
 ADAPTED_COLOUR, OWN_COLOUR = style.LEFT_COLOUR, style.RIGHT_COLOUR
-STRIP_HEIGHT, TRACE_HEIGHT, TITLE_HEIGHT = 0.75, 0.62, 0.75  # inches
-MAX_RATE = 40.0  # false alarms a minute, end of the ROC's axis
+STRIP_HEIGHT, TRACE_HEIGHT, TITLE_HEIGHT = 0.75, 0.55, 0.9  # inches
 
 
 class Responses(NamedTuple):
@@ -37,7 +36,7 @@ class ClipView(NamedTuple):
 
 @style.styled
 def plot_roc(rows: Sequence[JsonObject]) -> Figure:
-    """Plot hit rate against false alarms a minute for every threshold; rows as in scores.json."""
+    """Plot hit rate against the share of stretches with a false alarm, for every threshold; rows as in scores.json."""
     figure = Figure(figsize=(style.WIDTH, 3.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, scale, title in zip(panels, ("own", "adapted"), ("u as published", "Adapted response"), strict=True):
@@ -45,9 +44,9 @@ def plot_roc(rows: Sequence[JsonObject]) -> Figure:
             curve, area = row[scale]["roc"], row[scale]["auc"]
             colour, dashes = COLOURS[k % len(COLOURS)], "-" if k < len(COLOURS) else "--"
             label = f"{row['detector']} {_format(area)}"
-            # Staircases: with a lower threshold, what began later begins earlier, so the curve may go back.
-            axes.plot(curve["false_alarms_a_minute"], curve["hit_rate"], dashes, color=colour, label=label, alpha=0.85)
-        axes.set(xlabel="false alarms a minute", title=title, xlim=(0, MAX_RATE), ylim=(-0.02, 1.02))
+            x, y = ([*curve[name], 0.0] for name in ("stretches_with_alarm", "hit_rate"))
+            axes.plot(x, y, dashes, color=colour, label=label, alpha=0.85)
+        axes.set(xlabel="stretches with a false alarm", title=title, xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
         axes.legend(title="area under ROC", fontsize=6.5, title_fontsize=7, loc="lower right")
     panels[0].set_ylabel("hit rate")
     return figure
@@ -57,7 +56,8 @@ def plot_roc(rows: Sequence[JsonObject]) -> Figure:
 def plot_clip(clip: ClipView, responses: Mapping[str, Responses]) -> Figure:
     """Plot the responses of detectors to a clip below its pictures, which stand at their times."""
     height = TITLE_HEIGHT + STRIP_HEIGHT + TRACE_HEIGHT * len(responses)
-    figure = Figure(figsize=(style.WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(style.WIDTH, height))  # laid out by hand: it is drawn once a clip
+    figure.subplots_adjust(left=0.16, right=0.98, top=1 - 0.25 / height, bottom=0.62 / height, hspace=0.15)
     ratios = [STRIP_HEIGHT] + [TRACE_HEIGHT] * len(responses)
     panels = np.atleast_1d(figure.subplots(1 + len(responses), 1, sharex=True, height_ratios=ratios))
     _draw_strip(panels[0], clip)
@@ -71,7 +71,7 @@ def plot_clip(clip: ClipView, responses: Mapping[str, Responses]) -> Figure:
         for colour, width in ((OWN_COLOUR, 0.9), (ADAPTED_COLOUR, 1.2), (style.RED, 1.5), (style.DARK, 1.0))
     ]
     names = ["u as published", "adapted response", "alarm", *(["contact"] if clip.contact is not None else [])]
-    figure.legend(lines[: len(names)], names, loc="outside lower center", ncols=4)
+    figure.legend(lines[: len(names)], names, loc="lower center", ncols=4)
     return figure
 
 
