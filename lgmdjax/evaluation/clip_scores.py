@@ -35,7 +35,7 @@ WINDOW = 1.5  # s before contact
 LATE = 0.1  # s after contact
 PEAK_TOLERANCE = 0.4  # s, between the largest response of a clip and contact
 PERSISTENCES = (0.0, 0.1, 0.2, 0.3)  # s
-THRESHOLDS = 200  # that are tried, quantiles of all responses
+THRESHOLDS = 100  # that are tried of either kind
 LEVEL = 1e-9  # two scores this close are equal
 
 
@@ -87,9 +87,7 @@ def score(series: Sequence[Series]) -> JsonObject:
     """
     if sum(each.label.is_approach for each in series) < 2:
         raise InputError("expected two clips or more that approach, got fewer; label more clips")
-    thresholds = np.unique(
-        np.quantile(np.concatenate([each.response for each in series]), np.linspace(0, 1, THRESHOLDS))
-    )
+    thresholds = _candidates(np.concatenate([each.response for each in series]))
     counts = [count(each, thresholds, PERSISTENCES) for each in series]
     everything = range(len(series))
 
@@ -110,6 +108,12 @@ def score(series: Sequence[Series]) -> JsonObject:
         "roc": roc(counts, best[0]),
         "alarms": [begin(each, Setting(float(thresholds[best[1]]), PERSISTENCES[best[0]])) for each in series],
     }
+
+
+def _candidates(responses: Float[np.ndarray, " n"]) -> Float[np.ndarray, " thresholds"]:
+    """Return thresholds to try: quantiles, as responses may be crowded near 1, and evenly spaced ones."""
+    even = np.linspace(responses.min(), responses.max(), THRESHOLDS)
+    return np.unique(np.concatenate([np.quantile(responses, np.linspace(0, 1, THRESHOLDS)), even]))
 
 
 def score_fixed(series: Sequence[Series], setting: Setting) -> JsonObject:

@@ -43,7 +43,7 @@ def test_each_network_misses_motion_in_its_direction(turns, blind):
 
 
 def test_approach_excites_all_four_networks_and_the_fusion():
-    """A square that grows by 2 cells a frame on each side, and by as much in the other three."""
+    """A square that grows by a cell a frame on each side."""
     frames = np.full((8, 24, 24), 160.0)
     for k in range(8):
         frames[k, 10 - k : 14 + k, 10 - k : 14 + k] = 40.0
