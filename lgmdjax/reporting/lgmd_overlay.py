@@ -27,7 +27,7 @@ FloatT = TypeVar("FloatT", float, ndarray)
 PANEL_TITLES = ("left eye | right eye, above T_s in orange", "E  excitation", "I  inhibition", "S  summation")
 LAYER_GAIN = 8.0  # of the layers, which change by only a few grey levels
 GAP, LINE_HEIGHT, CURVE_HEIGHT = 4, 20, 96  # px: between panels, of a line of text, of the curves
-TEXT_WIDTH = 270  # px, of the responses of an eye
+TEXT_WIDTH = 240  # px, of the responses of an eye
 HISTORY_FRAMES = 150  # frames of u in the curves
 MIN_PANEL_HEIGHT = 200  # px; smaller pictures are enlarged
 BACKGROUND, TEXT_COLOUR, GRID_COLOUR = (24, 24, 24), (235, 235, 235), (90, 90, 90)
@@ -170,10 +170,8 @@ def _render_curves(layout: Layout, top: int, history: Sequence[ResponseSample]) 
     left, _, right, _ = layout.curve_box
     pen.text((left, 0), f"{now.time:.2f} s", fill=TEXT_COLOUR, font=font)
     for side, (name, colour) in enumerate(zip(("left", "right"), EYE_COLOURS, strict=True)):
-        text = f"{name} eye: u {now.u[side]:.2f}, adapted {now.adapted[side]:.2f}, FF {now.feed_forward[side]:.1f}"
+        text = f"{name} u {now.u[side]:.2f}, adapted {now.adapted[side]:.2f}, FF {now.feed_forward[side]:.1f}"
         pen.text((left + 60 + TEXT_WIDTH * side, 0), text, fill=colour, font=font)
-    if now.is_alarm:
-        pen.text((left + 60 + 2 * TEXT_WIDTH, 0), "ALARM", fill=ALARM_COLOUR, font=font)
     shown = history[-HISTORY_FRAMES:]
     x = right - np.arange(len(shown))[::-1] * (right - left) / HISTORY_FRAMES
     _, highest, _, lowest = layout.curve_box
@@ -184,6 +182,8 @@ def _render_curves(layout: Layout, top: int, history: Sequence[ResponseSample]) 
         for side, colour in enumerate(EYE_COLOURS):
             y = _to_pixel(layout.curve_box, curves[:, side]) - top
             pen.line(np.stack([x, y], axis=-1).ravel().tolist(), fill=colour, width=width)
+    if now.is_alarm:
+        pen.text((left + 4, LINE_HEIGHT + 4), "ALARM", fill=ALARM_COLOUR, font=font)
     return np.asarray(image).view(np.uint32)[..., 0]
 
 
