@@ -34,7 +34,7 @@ class Detectors(NamedTuple):
     """Constants of what runs on each eye; the alarm's frame time is that of the video."""
 
     lgmd: lgmd.Params
-    alarm: alarm.Params = alarm.Params()
+    alarm: alarm.Params
 
 
 class Responses(NamedTuple):

@@ -18,9 +18,8 @@ them; an object that passes is missed by one of the four.
 | S_f^D       | layers.summation           | grey    | P_f - W_I I_f^D; 0 where it is below T_s                        |
 | K_f^D       | response.networks          | grey    | mean of S_f^D                                                   |
 | F_f, T_FFI  | feed_forward, suppression  | grey    | mean of P_{f-1}; u is 0.5 where F_f >= T_FFI                    |
-| u_f^D       | -                          | 0..1    | 2 / (1 + exp(-K_f^D)) - 1                                       |
-| E_f         | response.excitation        | grey    | ln((1 + m) / (1 - m)), m the geometric mean of the four u^D     |
-| u           | response.u                 | 0.5..1  | (1 + m) / 2 = 1 / (1 + exp(-E_f))                               |
+| E_f         | response.excitation        | grey    | geometric mean of the four K_f^D: 0 if one of them is silent    |
+| u           | response.u                 | 0.5..1  | 1 / (1 + exp(-E_f))                                             |
 
 Network D is the one that does not see motion in direction D. Beyond the border nothing changes.
 
@@ -56,7 +55,7 @@ from lgmdjax.detectors.cells import U_AT_REST, Cells, Scalar, gate, mean, pool, 
 from lgmdjax.errors import InputError
 
 DIRECTIONS = ((0, -1), (0, 1), (-1, 0), (1, 0))  # steps in rows and columns: left, right, up, down
-SMALLEST = 1e-12  # of u^D inside a logarithm
+SMALLEST = 1e-12  # grey, of K inside a logarithm
 
 
 @struct.dataclass(kw_only=True)
@@ -130,12 +129,14 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
     """
     now = layers(params, state, frame)
     K = jax.vmap(mean)(now.summation)
-    m = jnp.exp(jnp.mean(jnp.log(jnp.tanh(0.5 * K) + SMALLEST))) * jnp.where(jnp.min(K) > 0, 1.0, 0.0).astype(K.dtype)
+    all_answer = jnp.where(jnp.min(K) > 0, jnp.ones((), K.dtype), jnp.zeros((), K.dtype))
+    E = all_answer * jnp.exp(jnp.mean(jnp.log(K + SMALLEST)))
     F = mean(state.changes[-1])
     passed = 1.0 - gate(F - params.suppression, params.suppression_width if params.smooth else None)
-    E = 2.0 * jnp.arctanh(jnp.minimum(m, 1.0 - jnp.finfo(K.dtype).eps))
     changes = jnp.concatenate([state.changes[1:], now.excitation[None]])
-    response = Response(u=U_AT_REST + 0.5 * passed * m, excitation=E, feed_forward=F, networks=K)
+    response = Response(
+        u=U_AT_REST + passed * (jax.nn.sigmoid(E) - U_AT_REST), excitation=E, feed_forward=F, networks=K
+    )
     return State(frame=pool(frame, params.pooling), changes=changes), response
 
 

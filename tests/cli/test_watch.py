@@ -19,7 +19,7 @@ import pytest
 from lgmdjax.cli import main
 from lgmdjax.cli.watch import StereoLayout, detect_looming
 from lgmdjax.cli.watch_files import Detectors
-from lgmdjax.detectors import lgmd
+from lgmdjax.detectors import alarm, lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import lgmd_overlay, video_io
 
@@ -232,7 +232,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pyt
 
 def test_an_unusual_frame_rate_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save(tmp_path / "fast.mp4", looming(72), rate=120)
-    detect_looming(path, tmp_path / "out", layout=StereoLayout(), params=Detectors(lgmd.Params()))
+    detect_looming(path, tmp_path / "out", layout=StereoLayout(), params=Detectors(lgmd.Params(), alarm.Params()))
     captured = capsys.readouterr()
     assert not captured.out
     assert "120 frames a second" in captured.err and "--threshold 1.5 --suppression 5" in captured.err

@@ -27,12 +27,12 @@ def dsn(frames, W_I=3.0, decay=0.8, T_s=12.0, T_FFI=25.0, reach=4, delay=1):
                     S = P[-1][y, x] - W_I * inhibition
                     summed += S if T_s <= S else 0.0
             K.append(summed / (h * w))
-        m = math.prod(2 / (1 + math.exp(-each)) - 1 for each in K) ** 0.25
+        E = math.prod(K) ** 0.25
         F = P[-2].mean()
         out.append(
             {
-                "u": (1 + m) / 2 if F < T_FFI else 0.5,
-                "excitation": math.log((1 + m) / (1 - m)),
+                "u": 1 / (1 + math.exp(-E)) if F < T_FFI else 0.5,
+                "excitation": E,
                 "feed_forward": F,
                 "networks": np.array(K),
             }
