@@ -25,9 +25,10 @@ Network D is the one that does not see motion in direction D. Beyond the border 
 
 Sources: Yue & Rind, "A synthetic vision system using directionally selective motion detectors to recognize collision",
 Artificial Life 13(2), 2007; "Postsynaptic organisations of directional selective visual neural networks for collision
-detection", Neurocomputing 103, 2013. Of both, the abstracts were at hand: inhibition that spreads in one direction
-with a delay of one or several frames; four directions; a fusion that was evolved. Equations of the networks and
-T_s = 12 are those of the public program of later work by the same group (fuqinbing/Binocular-DSN-Neural-Network-Model).
+detection", Neurocomputing 103, 2013. Of the second the abstract was at hand, and of the first what later work says of
+it: inhibition that spreads in one direction, one or several frames late; a fusion that was evolved. Equations of the
+networks and T_s = 12 are those of the public program of later work by the same group
+(fuqinbing/Binocular-DSN-Neural-Network-Model).
 
 | point      | papers, as far as known   | that program                     | here                                 |
 | ---------- | ------------------------- | -------------------------------- | ------------------------------------ |
