@@ -12,7 +12,7 @@ from lgmdjax.runtime.storage import JsonObject
 
 COLOURS = (*style.PALETTE, style.DARK, style.GREY, style.RED, "#8c564b")
 ADAPTED_COLOUR, OWN_COLOUR = style.LEFT_COLOUR, style.RIGHT_COLOUR
-STRIP_HEIGHT, TRACE_HEIGHT, TITLE_HEIGHT = 0.75, 0.55, 0.9  # inches
+STRIP_HEIGHT, TRACE_HEIGHT, TITLE_HEIGHT = 0.75, 0.6, 0.9  # inches
 
 
 class Responses(NamedTuple):
@@ -56,8 +56,8 @@ def plot_roc(rows: Sequence[JsonObject]) -> Figure:
 def plot_clip(clip: ClipView, responses: Mapping[str, Responses]) -> Figure:
     """Plot the responses of detectors to a clip below its pictures, which stand at their times."""
     height = TITLE_HEIGHT + STRIP_HEIGHT + TRACE_HEIGHT * len(responses)
-    figure = Figure(figsize=(style.WIDTH, height))  # laid out by hand: it is drawn once a clip
-    figure.subplots_adjust(left=0.16, right=0.98, top=1 - 0.25 / height, bottom=0.62 / height, hspace=0.15)
+    figure = Figure(figsize=(style.WIDTH, height), layout="none")  # by hand, which is fast: there is one for each clip
+    figure.subplots_adjust(left=0.2, right=0.98, top=1 - 0.25 / height, bottom=0.62 / height, hspace=0.3)
     ratios = [STRIP_HEIGHT] + [TRACE_HEIGHT] * len(responses)
     panels = np.atleast_1d(figure.subplots(1 + len(responses), 1, sharex=True, height_ratios=ratios))
     _draw_strip(panels[0], clip)
