@@ -30,7 +30,7 @@ import numpy as np
 from lgmd import run_opencv
 
 from lgmdjax.cli import watch
-from lgmdjax.detectors import lgmd
+from lgmdjax.detectors import alarm, lgmd
 from lgmdjax.reporting import video_io
 
 WIDTH, HEIGHT, FRAMES, ROUNDS = 1280, 720, 300, 5
@@ -52,7 +52,13 @@ def write_video(path: Path) -> Path:
 def run_watch(path: Path, out: Path, overlay: bool) -> None:
     """Run the command's work without its progress bar."""
     with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere):
-        watch.detect_looming(path, out, layout=watch.StereoLayout(), params=lgmd.Params(), overlay=overlay)
+        watch.detect_looming(
+            path,
+            out,
+            layout=watch.StereoLayout(),
+            params=watch.Detectors(lgmd.Params(), alarm.Params()),
+            overlay=overlay,
+        )
 
 
 def run_by_hand(path: Path, target: Path | None) -> None:

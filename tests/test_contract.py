@@ -17,7 +17,7 @@ import pytest
 from jaxtyping import Array, PyTree
 
 from lgmdjax.control import braitenberg, controller, names, navigator, policies
-from lgmdjax.detectors import d_lgmd, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, tau
+from lgmdjax.detectors import d_lgmd, dsn, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, tau
 from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.locomotion import cpg, shaping
 
@@ -148,6 +148,7 @@ COMPONENTS = (
         lambda: d_lgmd.Params(inhibition=0.2, threshold=0.2, interpolated=True, smooth=True),
         zero_gradient=("max_threshold",),  # does not apply
     ),
+    detector(dsn, lambda: dsn.Params(inhibition=0.5, threshold=1.0, smooth=True)),
     detector(emd, emd.Params),
     detector(grm, grm.Params, EMD_GAIN),
     detector(lplc2, lambda: replace(lplc2.create(5), intercept=0.3, inhibition_intercept=-0.01), EMD_GAIN),

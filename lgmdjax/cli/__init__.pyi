@@ -1,4 +1,5 @@
 from . import bench as bench
+from . import bench_clips as bench_clips
 from . import doctor as doctor
 from . import environment as environment
 from . import export as export
@@ -8,3 +9,4 @@ from . import study as study
 from . import tracking as tracking
 from . import trial as trial
 from . import watch as watch
+from . import watch_files as watch_files

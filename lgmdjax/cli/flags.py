@@ -99,6 +99,18 @@ class TrialFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AlarmFlags:
+    """When a response that rises is an alarm."""
+
+    threshold: float = 0.6
+    """adapted response of either eye, from 0.5 (no rise) to 1; 0.6 is half as much again as in the last seconds"""
+    persistence: float = 0.1
+    """how long it has to last [s]"""
+    exit_code: tyro.conf.FlagCreatePairsOff[bool] = False
+    """end with exit code 3 if there is an alarm, for scripts"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class WatchFlags:
     """The video, and how the detectors see it."""
 
@@ -132,14 +144,17 @@ class WatchFlags:
     """T_f, mean change of the picture above which the response is suppressed [grey levels]"""
     inhibition: float | None = None
     """W_I, weight of the inhibition"""
+    alarm: AlarmFlags = AlarmFlags()
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchFlags:
     """What detectors are compared on, and which."""
 
-    on: tyro.conf.Positional[Literal["stimuli"]]
-    """stimuli: laboratory stimuli, from approach to a flash of light"""
+    on: tyro.conf.Positional[Literal["stimuli", "clips"]]
+    """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos"""
+    paths: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """with clips, the folder of the videos, and the file of their labels if it is not labels.csv in that folder"""
     detector: tuple[str, ...] = ("all",)
     """detectors by name, or module:attribute for one of your own; all stands for those of lgmdjax.detectors"""
     scale: BenchScale = "quick"

@@ -25,6 +25,7 @@ from lgmdjax.runtime.jax_setup import prepare_jax
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
 NOT_RESUMED = ("watch", "export", "export-dataset", "bench", "doctor")
+ALARM_CODE = 3  # exit code of `lgmdjax watch --alarm.exit-code` after an alarm
 MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
@@ -84,16 +85,18 @@ def study(arguments: Sequence[str]) -> None:
     print(f"look into {run_study(name, given)}")
 
 
-def watch(arguments: Sequence[str]) -> None:
-    """Run the two looming detectors on a video: responses of each frame, plot, overlay video."""
+def watch(arguments: Sequence[str]) -> int:
+    """Run the two looming detectors on a video: responses of each frame, alarms, plot, overlay video."""
     from lgmdjax.cli import flags
 
     given = flags.parse_watch(_summary(watch), arguments)
     environment.check_jax()
     from lgmdjax.cli.watch import watch_video
 
-    for file in watch_video(given):
+    watched = watch_video(given)
+    for file in watched.files:
         print(file)
+    return ALARM_CODE if watched.alarms and given.alarm.exit_code else 0
 
 
 def export(arguments: Sequence[str]) -> None:
@@ -121,14 +124,15 @@ def export_dataset(arguments: Sequence[str]) -> None:
 
 
 def bench(arguments: Sequence[str]) -> None:
-    """Compare looming detectors on laboratory stimuli: table, JSON, figure."""
+    """Compare looming detectors on laboratory stimuli or labelled videos: table, JSON, figure, page."""
     from lgmdjax.cli import flags
 
     given = flags.parse_bench(_summary(bench), arguments)
     environment.check_jax()
     from lgmdjax.cli.bench import run_bench
+    from lgmdjax.cli.bench_clips import run_clips
 
-    for line in run_bench(given):
+    for line in run_clips(given) if given.on == "clips" else run_bench(given):
         print(line, flush=True)
 
 

@@ -6,52 +6,41 @@ Writes to a folder with the full name of the video:
 | ----------------------------- | ------------------------------------------------------------------ |
 | response.csv or .parquet      | the responses, one row for each frame                              |
 | response.png                  | plot of the responses over time                                    |
+| alarms.json                   | when alarms begin and end, and with which settings                 |
 | overlay.mp4                   | the pictures of both eyes, the layers E, I and S, and u over time; |
 |                               | not with --no-overlay                                              |
 """
 
 import contextlib
-import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
-from fractions import Fraction
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv
-import pyarrow.parquet
 from jaxtyping import Array, Float, UInt8
-from matplotlib.figure import Figure
 from tqdm.auto import tqdm
 
-from lgmdjax import __version__
+from lgmdjax.cli import watch_files
 from lgmdjax.cli.flags import WatchFlags
-from lgmdjax.detectors import lgmd
+from lgmdjax.cli.watch_files import Detectors, Responses, TableFormat
+from lgmdjax.detectors import alarm, lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
-from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import partial_files
+from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import hemifield
 from lgmdjax.sensors.settings import check_field
 
 MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third is the first with all of it
 MIN_SIZE = 16  # px, smallest width and height of the picture of an eye
 NOMINAL_RATE = 30  # Hz, of the robot's cameras
-TableFormat = Literal["csv", "parquet"]
-UNITS = {
-    "time": "s",
-    "u": "1, from 0.5 (still) to 1",
-    "feed_forward": "grey level",
-    "excitation": "grey level",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +53,15 @@ class StereoLayout:
     width: int = 320  # px of one picture; wider ones are averaged down to it
 
 
-def watch_video(flags: WatchFlags) -> list[Path]:
-    """Run both detectors on the video of the flags, and return the written files."""
+class Watched(NamedTuple):
+    """What was written, and what was seen."""
+
+    files: list[Path]
+    alarms: list[JsonObject]  # with start and end [s]
+
+
+def watch_video(flags: WatchFlags) -> Watched:
+    """Run both detectors on the video of the flags."""
     if flags.mono and flags.stereo is not None:
         raise InputError("expected --mono or --stereo, got both; leave one out")
     given = {name: getattr(flags, name) for name in lgmd.SCALARS}
@@ -83,8 +79,14 @@ def watch_video(flags: WatchFlags) -> list[Path]:
     layout = StereoLayout(
         stereo=flags.stereo is not None, overlap=flags.overlap, ground=flags.ground, width=flags.width
     )
+    raised = alarm.Params(threshold=flags.alarm.threshold, persistence=flags.alarm.persistence)
     return detect_looming(
-        flags.video, flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
+        flags.video,
+        flags.out,
+        layout=layout,
+        params=Detectors(params, raised),
+        table=flags.table,
+        overlay=flags.overlay,
     )
 
 
@@ -93,62 +95,42 @@ def detect_looming(
     out: Path,
     *,
     layout: StereoLayout,
-    params: lgmd.Params,
+    params: Detectors,
     table: TableFormat = "csv",
     overlay: bool = True,
-) -> list[Path]:
-    """Run both detectors on a video, and return the files written to out/<name of the video>/.
+) -> Watched:
+    """Run both detectors on a video; files are written to out/<name of the video>/.
 
     Raises InputError, and writes nothing, if the video is missing, damaged, too short, or does not fit the layout.
     """
-    lgmd.check(params)
+    lgmd.check(params.lgmd)
+    alarm.check(params.alarm)
     folder = out / path.name
     with video_io.open_reader(path) as video:
         width, height = _scaled_size(path, video, layout)
         eyes = _split(np.zeros((height, width), np.uint8), layout)
         overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
         _print_notes(path, video)
+        params = params._replace(alarm=replace(params.alarm, frame_time=1 / float(video.rate)))
         with partial_files.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
-            samples, excitations = _process(
-                frames, layout, params, overlay=overlay_layout, target=partial_folder / "overlay.mp4", rate=video.rate
-            )
-            if len(samples) < MIN_FRAMES:
+            with contextlib.ExitStack() as stack:
+                write = None
+                if overlay_layout is not None:
+                    target, size = partial_folder / "overlay.mp4", overlay_layout.size
+                    write = stack.enter_context(video_io.open_writer(target, *size, video.rate, fast=True))
+                seen = _process(frames, layout, params, overlay_layout, write)
+            if len(seen.samples) < MIN_FRAMES:
                 raise InputError(
-                    f"expected a video of {MIN_FRAMES} frames or more, got {len(samples)} in {path}; take a longer one"
+                    f"expected a video of {MIN_FRAMES} frames or more, got {len(seen.samples)} in {path}; "
+                    "take a longer one"
                 )
-            responses = _table(samples, excitations, _metadata(path, video, layout, params))
-            _write_table(responses, partial_folder, table)
-            (partial_folder / "response.png").write_bytes(style.to_png(plot(responses, params)))
-    written = [f"response.{table}", "response.png", *(["overlay.mp4"] if overlay else [])]
+            name = os.fsencode(path.name).decode("utf-8", "replace")
+            facts = {"video": name, "eyes": asdict(layout), "rate": float(video.rate)}
+            alarms = watch_files.write_files(partial_folder, seen, params, facts, table)
+    written = [f"response.{table}", "response.png", "alarms.json", *(["overlay.mp4"] if overlay else [])]
     for earlier in {"response.csv", "response.parquet", "overlay.mp4"} - set(written):
         (folder / earlier).unlink(missing_ok=True)
-    return [folder / name for name in written]
-
-
-def _write_table(responses: pa.Table, folder: Path, table: TableFormat) -> None:
-    """Write the responses; the file is opened here, because Arrow refuses names that are not UTF-8."""
-    with (folder / f"response.{table}").open("wb") as file:
-        if table == "csv":
-            pyarrow.csv.write_csv(responses, file)
-        else:
-            pyarrow.parquet.write_table(responses, file)
-
-
-@style.styled
-def plot(responses: pa.Table, params: lgmd.Params) -> Figure:
-    """Plot u and FF of both eyes over time, with the threshold T_f above which FF suppresses u."""
-    figure = Figure(figsize=(style.WIDTH, 3.4))
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    time = responses["time"].to_numpy()
-    for side, colour in zip(hemifield.SIDES, (style.LEFT_COLOUR, style.RIGHT_COLOUR), strict=True):
-        upper.plot(time, responses[f"u_{side}"].to_numpy(), color=colour, label=f"{side} eye")
-        lower.plot(time, responses[f"feed_forward_{side}"].to_numpy(), color=colour)
-    lower.axhline(float(params.suppression), color=style.GREY, linestyle=":", label="T_f")
-    upper.set(ylabel="u", ylim=(0.48, 1.02), title="response of the two LGMDs")
-    lower.set(ylabel="FF [grey levels]", xlabel="time [s]")
-    upper.legend(loc="upper left", ncols=2)
-    lower.legend(loc="upper left")
-    return figure
+    return Watched([folder / name for name in written], alarms)
 
 
 def _print_notes(path: Path, video: video_io.Video) -> None:
@@ -200,24 +182,32 @@ def _split(picture: UInt8[np.ndarray, "height width"], layout: StereoLayout) -> 
     return np.stack(crops).astype(jnp.result_type(float))
 
 
+States = tuple[lgmd.State, alarm.State]
+
+
 @jax.jit
-def _init(params: lgmd.Params, pictures: Float[Array, "2 height eye"]) -> lgmd.State:
-    return jax.vmap(partial(lgmd.init, params))(_outermost_first(params, pictures))
+def _init(params: Detectors, pictures: Float[Array, "2 height eye"]) -> States:
+    seen = _outermost_first(params.lgmd, pictures)
+    return jax.vmap(partial(lgmd.init, params.lgmd))(seen), jax.vmap(partial(alarm.init, params.alarm))(pictures)
 
 
 @jax.jit
 def _step(
-    params: lgmd.Params, states: lgmd.State, pictures: Float[Array, "2 height eye"]
-) -> tuple[lgmd.State, Float[Array, "3 2"], lgmd.Layers]:
-    """Return the next states, u, FF and excitation of both eyes, and the layers for the overlay.
+    params: Detectors, states: States, pictures: Float[Array, "2 height eye"]
+) -> tuple[States, Float[Array, "5 2"], lgmd.Layers]:
+    """Return the next states, u, FF, excitation, adapted response and alarm of both eyes, and the layers.
 
     The layers are also returned without an overlay: another program would round u otherwise.
     """
-    pictures = _outermost_first(params, pictures)
-    layers = jax.vmap(partial(lgmd.layers, params))(states, pictures)
-    states, response = jax.vmap(partial(lgmd.step, params))(states, pictures)
-    shown = jax.tree.map(partial(_to_pixels, params, pictures.shape[1:]), layers)
-    return states, jnp.stack([response.u, response.feed_forward, response.excitation]), shown
+    seen, adapting = states
+    ordered = _outermost_first(params.lgmd, pictures)
+    layers = jax.vmap(partial(lgmd.layers, params.lgmd))(seen, ordered)
+    seen, response = jax.vmap(partial(lgmd.step, params.lgmd))(seen, ordered)
+    views = alarm.View(frame=pictures, excitation=response.excitation)
+    adapting, adapted = jax.vmap(partial(alarm.step, params.alarm))(adapting, views)
+    rows = [response.u, response.feed_forward, response.excitation, adapted.adapted, adapted.alarm]
+    shown = jax.tree.map(partial(_to_pixels, params.lgmd, pictures.shape[1:]), layers)
+    return (seen, adapting), jnp.stack(rows), shown
 
 
 def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns"]) -> Float[Array, "2 rows columns"]:
@@ -237,33 +227,24 @@ def _to_pixels(params: lgmd.Params, shape: tuple[int, int], layer: Float[Array, 
 def _process(
     frames: Iterable[video_io.Frame],
     layout: StereoLayout,
-    params: lgmd.Params,
-    *,
+    params: Detectors,
     overlay: lgmd_overlay.Layout | None,
-    target: Path,
-    rate: Fraction,
-) -> tuple[list[lgmd_overlay.ResponseSample], list[tuple[float, float]]]:
-    """Run the detectors over the frames; return responses and excitations of each frame.
-
-    With an overlay, its video is written to the target.
-    """
+    write: Callable[[UInt8[np.ndarray, "height width channels"]], None] | None,
+) -> Responses:
+    """Run the detectors over the frames and return the responses; with an overlay, write that of each frame."""
     samples: list[lgmd_overlay.ResponseSample] = []
     excitations: list[tuple[float, float]] = []
-    threshold = float(params.threshold)
-    with contextlib.ExitStack() as stack:
-        write = None
-        if overlay is not None:
-            write = stack.enter_context(video_io.open_writer(target, *overlay.size, rate, fast=True))
-        for sample, excitation, pictures, layers in _respond(frames, layout, params):
-            samples.append(sample)
-            excitations.append(excitation)
-            if overlay is not None and write is not None:
-                write(lgmd_overlay.render_overlay(overlay, pictures, layers, threshold, samples))
-    return samples, excitations
+    threshold = float(params.lgmd.threshold)
+    for sample, excitation, pictures, layers in _respond(frames, layout, params):
+        samples.append(sample)
+        excitations.append(excitation)
+        if overlay is not None and write is not None:
+            write(lgmd_overlay.render_overlay(overlay, pictures, layers, threshold, samples))
+    return Responses(samples, excitations)
 
 
 def _respond(
-    frames: Iterable[video_io.Frame], layout: StereoLayout, params: lgmd.Params
+    frames: Iterable[video_io.Frame], layout: StereoLayout, params: Detectors
 ) -> Iterator[tuple[lgmd_overlay.ResponseSample, tuple[float, float], np.ndarray, lgmd.Layers]]:
     """Yield responses, excitations, pictures and layers of each frame.
 
@@ -274,25 +255,6 @@ def _respond(
         pictures = _split(frame.picture, layout)
         states = _init(params, jnp.asarray(pictures)) if states is None else states
         states, responses, layers = _step(params, states, jnp.asarray(pictures))
-        u, feed_forward, excitation = ((left, right) for left, right in np.asarray(responses).tolist())
-        yield lgmd_overlay.ResponseSample(frame.time, u, feed_forward), excitation, pictures, layers
-
-
-def _table(
-    samples: list[lgmd_overlay.ResponseSample], excitations: list[tuple[float, float]], metadata: dict[str, str]
-) -> pa.Table:
-    """Return the responses as a table with one row for each frame."""
-    columns: dict[str, object] = {"frame": range(len(samples)), "time": [sample.time for sample in samples]}
-    for side, name in enumerate(hemifield.SIDES):
-        columns[f"u_{name}"] = [sample.u[side] for sample in samples]
-        columns[f"feed_forward_{name}"] = [sample.feed_forward[side] for sample in samples]
-        columns[f"excitation_{name}"] = [pair[side] for pair in excitations]
-    return pa.table({name: pa.array(values) for name, values in columns.items()}, metadata=metadata)
-
-
-def _metadata(path: Path, video: video_io.Video, layout: StereoLayout, params: lgmd.Params) -> dict[str, str]:
-    constants = {name: float(getattr(params, name)) for name in lgmd.SCALARS}
-    seen = {"pooling": params.pooling, "falloff": params.falloff}
-    facts = {"units": UNITS, "eyes": asdict(layout) | seen, "lgmd": constants, "rate": float(video.rate)}
-    name = os.fsencode(path.name).decode("utf-8", "replace")
-    return {"video": name, "lgmdjax": __version__} | {key: json.dumps(fact) for key, fact in facts.items()}
+        u, feed_forward, excitation, adapted, alarms = ((left, right) for left, right in np.asarray(responses).tolist())
+        is_alarm = max(alarms) > 0
+        yield lgmd_overlay.ResponseSample(frame.time, u, feed_forward, adapted, is_alarm), excitation, pictures, layers

@@ -7,10 +7,12 @@
 | lgmd1_onoff    | locust, Fu et al. 2018: ON and OFF channels, adaptation                    |
 | lgmd2          | locust, Fu et al. 2020: dark objects alone                                 |
 | d_lgmd         | locust, Zhao et al. 2021: distributed excitation and inhibition            |
+| dsn            | locust, Yue & Rind 2007 and 2013: four direction selective networks, fused |
 | emd            | Hassenstein & Reichardt 1956: elementary motion detectors                  |
 | grm            | Chalupka et al. 2016: generalised regressive motion                        |
 | lplc2          | fruit fly, Klapoetke et al. 2017 and Zhou et al. 2022: outward motion      |
-| eta, tau       | ideal observers, which get the geometry: Gabbiani et al. 1999, Lee 1976 |
+| eta, tau       | ideal observers, which get the geometry: Gabbiani et al. 1999, Lee 1976    |
+| alarm          | a scale that adapts to the scene, threshold and persistence, for any of them |
 | cells, on_off  | what several of them share                                                 |
 """
 

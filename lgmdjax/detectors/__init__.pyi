@@ -1,5 +1,7 @@
+from . import alarm as alarm
 from . import cells as cells
 from . import d_lgmd as d_lgmd
+from . import dsn as dsn
 from . import emd as emd
 from . import eta as eta
 from . import grm as grm

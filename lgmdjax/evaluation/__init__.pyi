@@ -1,3 +1,6 @@
+from . import clip_labels as clip_labels
+from . import clip_responses as clip_responses
+from . import clip_scores as clip_scores
 from . import collision_causes as collision_causes
 from . import contacts as contacts
 from . import gait_test as gait_test

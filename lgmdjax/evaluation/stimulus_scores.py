@@ -27,6 +27,7 @@ from scipy import stats
 
 from lgmdjax.detectors import (
     d_lgmd,
+    dsn,
     emd,
     eta,
     grm,
@@ -82,6 +83,7 @@ DETECTORS: Mapping[str, DetectorSetup] = {
     "lgmd1_onoff": _published(lgmd1_onoff),
     "lgmd2": _published(lgmd2),
     "d_lgmd": _published(d_lgmd),
+    "dsn": _published(dsn),
     "emd": DetectorSetup(emd, _correlators),
     "grm": DetectorSetup(grm, lambda eye: grm.Params(motion=_correlators(eye))),
     "lplc2": DetectorSetup(lplc2, lambda eye: lplc2.Params(motion=_correlators(eye))),

@@ -1,3 +1,4 @@
+from . import clip_page as clip_page
 from . import figures as figures
 from . import inline_video as inline_video
 from . import lgmd_overlay as lgmd_overlay

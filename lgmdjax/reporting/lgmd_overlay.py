@@ -5,7 +5,8 @@
 | eyes   | pictures, orange where S exceeds the threshold T_s                                    |
 | E, I   | excitation and inhibition, multiplied by eight                                        |
 | S      | summation: orange where it exceeds T_s, blue where inhibition outweighs excitation    |
-| below  | u of the last frames, left blue and right orange                                      |
+| below  | u of the last frames, left blue and right orange; thinner the adapted response, red   |
+|        | where there is an alarm                                                               |
 """
 
 from collections.abc import Sequence
@@ -27,6 +28,7 @@ FloatT = TypeVar("FloatT", float, ndarray)
 PANEL_TITLES = ("left eye | right eye, above T_s in orange", "E  excitation", "I  inhibition", "S  summation")
 LAYER_GAIN = 8.0  # of the layers, which change by only a few grey levels
 GAP, LINE_HEIGHT, CURVE_HEIGHT = 4, 20, 96  # px: between panels, of a line of text, of the curves
+TEXT_WIDTH = 240  # px, of the responses of an eye
 HISTORY_FRAMES = 150  # frames of u in the curves
 MIN_PANEL_HEIGHT = 200  # px; smaller pictures are enlarged
 BACKGROUND, TEXT_COLOUR, GRID_COLOUR = (24, 24, 24), (235, 235, 235), (90, 90, 90)
@@ -34,6 +36,7 @@ ABOVE_THRESHOLD_COLOUR, INHIBITED_COLOUR = np.array([255.0, 130.0, 30.0]), np.ar
 MAX_SIZE = 8192  # px, of a video that players show
 MIN_BRIGHTNESS = 0.35  # of a coloured cell, which would be too dark to see
 GREY, ABOVE_THRESHOLD, INHIBITED = 0, 256, 512  # first index of each row of the palette
+ALARM_COLOUR = "#FF4040"
 EYE_COLOURS = ("#56B4E9", "#E69F00")  # blue and orange as in the figures, in lighter shades for a dark background
 
 
@@ -57,6 +60,8 @@ class ResponseSample(NamedTuple):
     time: float  # s
     u: tuple[float, float]
     feed_forward: tuple[float, float]  # grey
+    adapted: tuple[float, float] = (0.5, 0.5)  # A of `lgmdjax.detectors.alarm`
+    is_alarm: bool = False  # of either eye
 
 
 def make_layout(rows: int, columns: int) -> Layout:
@@ -166,13 +171,20 @@ def _render_curves(layout: Layout, top: int, history: Sequence[ResponseSample]) 
     left, _, right, _ = layout.curve_box
     pen.text((left, 0), f"{now.time:.2f} s", fill=TEXT_COLOUR, font=font)
     for side, (name, colour) in enumerate(zip(hemifield.SIDES, EYE_COLOURS, strict=True)):
-        text = f"{name} eye: u {now.u[side]:.2f}, FF {now.feed_forward[side]:.1f}"
-        pen.text((left + 80 + 180 * side, 0), text, fill=colour, font=font)
-    u = np.array([sample.u for sample in history[-HISTORY_FRAMES:]])
-    x = right - np.arange(len(u))[::-1] * (right - left) / HISTORY_FRAMES
-    for side, colour in enumerate(EYE_COLOURS):
-        y = _to_pixel(layout.curve_box, u[:, side]) - top
-        pen.line(np.stack([x, y], axis=-1).ravel().tolist(), fill=colour, width=2)
+        text = f"{name} u {now.u[side]:.2f}, adapted {now.adapted[side]:.2f}, FF {now.feed_forward[side]:.1f}"
+        pen.text((left + 60 + TEXT_WIDTH * side, 0), text, fill=colour, font=font)
+    shown = history[-HISTORY_FRAMES:]
+    x = right - np.arange(len(shown))[::-1] * (right - left) / HISTORY_FRAMES
+    _, highest, _, lowest = layout.curve_box
+    for alarmed in x[[sample.is_alarm for sample in shown]]:
+        pen.line([(alarmed, highest - top), (alarmed, lowest - top)], fill=ALARM_COLOUR, width=1)
+    for values, width in (("adapted", 1), ("u", 2)):
+        curves = np.clip([getattr(sample, values) for sample in shown], U_AT_REST, 1)
+        for side, colour in enumerate(EYE_COLOURS):
+            y = _to_pixel(layout.curve_box, curves[:, side]) - top
+            pen.line(np.stack([x, y], axis=-1).ravel().tolist(), fill=colour, width=width)
+    if now.is_alarm:
+        pen.text((left + 4, LINE_HEIGHT + 4), "ALARM", fill=ALARM_COLOUR, font=font)
     return np.asarray(image).view(np.uint32)[..., 0]
 
 

@@ -19,7 +19,8 @@ import pytest
 
 from lgmdjax.cli import main
 from lgmdjax.cli.watch import StereoLayout, detect_looming
-from lgmdjax.detectors import lgmd
+from lgmdjax.cli.watch_files import Detectors
+from lgmdjax.detectors import alarm, lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import lgmd_overlay, video_io
 
@@ -53,7 +54,7 @@ def run(path: Path, *flags: str) -> pa.Table:
     """Run `lgmdjax watch` on a video, and return the table of responses."""
     assert main.main(["watch", str(path), "--out", str(path.parent / "out"), *flags]) == 0
     folder = path.parent / "out" / path.name
-    assert sorted(file.suffix for file in folder.iterdir()) == sorted([".mp4", ".png", _suffix(flags)])
+    assert sorted(file.suffix for file in folder.iterdir()) == sorted([".json", ".mp4", ".png", _suffix(flags)])
     found = folder / f"response{_suffix(flags)}"
     return pyarrow.csv.read_csv(found) if found.suffix == ".csv" else pyarrow.parquet.read_table(found)
 
@@ -157,6 +158,22 @@ def test_the_overlay_shows_every_frame_and_marks_the_cells_above_threshold(tmp_p
             assert (orange > 0.005) == (orange_expected and is_excited), (name, side, orange)
 
 
+def test_an_approach_raises_an_alarm_and_a_script_hears_of_it(tmp_path: Path) -> None:
+    """The disc comes on the right; the alarm begins while it grows, and is the same in table, JSON and exit code."""
+    path = save(tmp_path / "disc.mp4", looming(72))
+    flags = ["--out", str(tmp_path / "out"), "--no-overlay", "--alarm.exit-code", "--table", "parquet"]
+    assert main.main(["watch", str(path), *flags]) == main.ALARM_CODE == 3
+    table = pyarrow.parquet.read_table(tmp_path / "out" / "disc.mp4" / "response.parquet")
+    (raised,) = json.loads((tmp_path / "out" / "disc.mp4" / "alarms.json").read_text())["alarms"]
+    is_alarm = column(table, "alarm") > 0
+    adapted = np.maximum(column(table, "adapted_left"), column(table, "adapted_right"))
+    lasting = np.convolve(adapted >= 0.6, np.ones(3))[:FRAMES] == 3  # 0.1 s at 30 frames a second
+    np.testing.assert_array_equal(is_alarm, lasting)
+    assert raised["start"] == pytest.approx(column(table, "time")[is_alarm][0]) and raised["start"] > 0.3
+    assert raised["end"] == pytest.approx(column(table, "time")[is_alarm][-1] + 1 / 30)
+    assert main.main(["watch", str(path), *flags, "--alarm.threshold", "0.99"]) == 0
+
+
 @pytest.mark.parametrize(
     ("kind", "flags", "words"),
     [
@@ -169,6 +186,7 @@ def test_the_overlay_shows_every_frame_and_marks_the_cells_above_threshold(tmp_p
         ("good", ("--threshold", "-1"), "lgmd threshold"),
         ("good", ("--suppression", "nan"), "lgmd suppression"),
         ("good", ("--overlap", "0.2"), "overlap"),
+        ("good", ("--alarm.threshold", "0.3"), "alarm threshold"),
         ("good", ("--width", "8"), "16 px or more"),
         ("good", ("--width", "-8"), "16 px or more"),
         ("good", ("--out", ""), "a value for --out, got an empty one"),
@@ -235,7 +253,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pyt
 
 def test_an_unusual_frame_rate_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = save(tmp_path / "fast.mp4", looming(72), rate=120)
-    detect_looming(path, tmp_path / "out", layout=StereoLayout(), params=lgmd.Params())
+    detect_looming(path, tmp_path / "out", layout=StereoLayout(), params=Detectors(lgmd.Params(), alarm.Params()))
     captured = capsys.readouterr()
     assert not captured.out
     assert "120 frames a second" in captured.err and "--threshold 1.5 --suppression 5" in captured.err
@@ -248,7 +266,7 @@ def test_without_an_overlay_the_responses_are_the_same(tmp_path: Path) -> None:
     with_overlay = (folder / "response.csv").read_bytes()
     assert main.main(["watch", str(path), "--out", str(tmp_path / "out"), "--no-overlay"]) == 0
     assert (folder / "response.csv").read_bytes() == with_overlay
-    assert sorted(file.name for file in folder.iterdir()) == ["response.csv", "response.png"]
+    assert sorted(file.name for file in folder.iterdir()) == ["alarms.json", "response.csv", "response.png"]
 
 
 @pytest.mark.parametrize("name", ["12:30:05.mp4", "-x.mp4", b"caf\xe9.mp4"])
@@ -260,7 +278,7 @@ def test_any_name_of_a_video_will_do(tmp_path: Path, name: str | bytes, monkeypa
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), "utf-8"))  # pytest cannot read such names
     assert main.main(["watch", "--out", "~/out", "--table", "parquet", "--", path.name]) == 0
     written = sorted(file.name for file in (tmp_path / "out" / path.name).iterdir())
-    assert written == ["overlay.mp4", "response.parquet", "response.png"]
+    assert written == ["alarms.json", "overlay.mp4", "response.parquet", "response.png"]
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "ascii"])  # of the locales C.UTF-8 and POSIX

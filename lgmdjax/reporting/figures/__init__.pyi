@@ -1,3 +1,4 @@
+from . import clip_scores as clip_scores
 from . import comparison as comparison
 from . import detection as detection
 from . import learning as learning

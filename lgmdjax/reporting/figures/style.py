@@ -18,6 +18,7 @@ palette of Okabe & Ito, which colour-blind readers can tell apart.
 | `trajectories.plot_passages`                  | 14, 16       | paths past an obstacle                               |
 | `comparison.plot_collision_rates`             | -            | collisions per 100 m of every policy, with intervals |
 | `stimulus_scores.plot`                        | -            | looming detectors on laboratory stimuli              |
+| `clip_scores.plot_roc`, `plot_clip`           | -            | looming detectors on video clips                     |
 | `comparison.plot_collisions_against_coverage` | -            | the same against the floor that every policy sees    |
 """
 
