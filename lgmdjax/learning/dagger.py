@@ -27,7 +27,7 @@ from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, room_batches
 from lgmdjax.simulation.episodes import Walk
 
-FIRST_LEARNER_EPISODE = room_batches.LEARNER_EPISODES[0]  # number of the first DAgger round's episode
+FIRST_LEARNER_EPISODE = 2**19  # number of the first DAgger round's episode; its rooms are in no other episode
 TURN_GAIN_EPISODE = 2**20  # number of the episode in whose rooms turn gains are compared
 APPROACH_CLEARANCE = 0.08  # m
 MIN_RELATIVE_COVERAGE = 0.9  # of the best coverage of all turn gains, for a gain to be chosen

@@ -17,12 +17,11 @@ from jaxtyping import Array, Float
 
 from lgmdjax.simulation.closed_loop import Room
 from lgmdjax.simulation.settings import BenchmarkRooms
-from lgmdjax.world import scenes, variation
-from lgmdjax.world.arena import Arena, at_time, sample_free_poses
+from lgmdjax.world import scenes
+from lgmdjax.world.arena import Arena, sample_free_poses
 
 START_COUNT = 32  # starts of a room's robot, one for each reset, used in order
 BENCHMARK_EPISODE = 2**23  # episode number of `benchmark_rooms`; training episodes never get so far
-LEARNER_EPISODES = range(2**19, 2**20)  # episode numbers in which the learner walks; the teacher's are below
 CONTRAST_RANGE = (0.3, 1.0)  # factors by which the contrast of training rooms is scaled
 OVERHEAD_SHARE = 0.2  # of the obstacles in training rooms
 
@@ -70,31 +69,18 @@ def training_rooms(seed: int, episode: int, robots: int) -> Room:
     """Return the random rooms of a training episode, with contrasts in `CONTRAST_RANGE` and a few obstacles overhead.
 
     Rooms of low contrast are needed: a navigator trained only in rooms of high contrast hardly turns from the one
-    moving edge in front of a plain wall, since little motion then means little danger. `lgmdjax.world.variation` says
-    why obstacles overhead are needed, and obstacles that move.
-
-    In `LEARNER_EPISODES`, obstacles come into the way of most robots in the first 20 s. In the teacher's episodes and
-    all others nothing moves, so that they are free of collisions, as in the paper.
+    moving edge in front of a plain wall, since little motion then means little danger. Obstacles overhead are needed
+    for table tops and crowns of trees: a navigator that never walked under anything turns round in front of them.
     """
     key = jax.random.fold_in(jax.random.key(seed), episode)
     rooms = random_rooms(key, robots)
-    overhead_key, moving_key, starts_key = (
-        jax.random.split(jax.random.fold_in(key, robots + k), robots) for k in range(1, 4)
-    )
-    contrast = jax.random.uniform(jax.random.fold_in(key, robots), (robots,), jnp.float32, *CONTRAST_RANGE)
+    contrast_key, overhead_key = (jax.random.fold_in(key, robots + k) for k in range(2))
+    contrast = jax.random.uniform(contrast_key, (robots,), jnp.float32, *CONTRAST_RANGE)
 
     def vary(arena: Arena, contrast: Array, key: Array) -> Arena:
-        return variation.raise_obstacles(scenes.scale_contrast(arena, contrast), key, OVERHEAD_SHARE)
+        return scenes.raise_obstacles(scenes.scale_contrast(arena, contrast), key, OVERHEAD_SHARE)
 
-    rooms = replace(rooms, arena=jax.vmap(vary)(rooms.arena, contrast, overhead_key))
-    return jax.vmap(_set_in_motion)(rooms, moving_key, starts_key) if episode in LEARNER_EPISODES else rooms
-
-
-def _set_in_motion(room: Room, key: Array, starts_key: Array) -> Room:
-    """Let obstacles cross the path from the first start; later starts are free where these have arrived."""
-    arena = variation.cross_path(room.arena, key, room.starts[0])
-    later = sample_free_poses(starts_key, at_time(arena, jnp.inf), START_COUNT - 1)
-    return replace(room, arena=arena, starts=jnp.concatenate([room.starts[:1], later]))
+    return replace(rooms, arena=jax.vmap(vary)(rooms.arena, contrast, jax.random.split(overhead_key, robots)))
 
 
 def benchmark_rooms(benchmark: BenchmarkRooms, seed: int, contrast: float = 1.0) -> Room:

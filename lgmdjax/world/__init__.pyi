@@ -4,4 +4,3 @@ from . import obstacles as obstacles
 from . import raycast as raycast
 from . import scenes as scenes
 from . import texture as texture
-from . import variation as variation

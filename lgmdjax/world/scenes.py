@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from lgmdjax.geometry import rotate
 from lgmdjax.world.arena import Arena, clearance, empty_room
-from lgmdjax.world.obstacles import CAPACITY, Prisms, concatenate, inactive, make_prisms
+from lgmdjax.world.obstacles import CAPACITY, Prisms, concatenate, inactive, make_prisms, raise_prisms
 
 MIN_GAP = 0.8
 """Minimum gap between obstacles and around the start [m]: twice the width of the robot."""
@@ -254,6 +254,17 @@ def with_random_textures(
         wall_texture=scale(samples[second:-2], (120.0, 0.5, 0.0, 0.3), (170.0, 0.7, 2.0 * jnp.pi, 0.6)),
         floor_texture=scale(samples[-2], (110.0, 0.05, 0.0, 0.2), (150.0, max_floor_contrast, 2.0 * jnp.pi, 0.5)),
         sky=200.0 + 50.0 * samples[-1, 0],
+    )
+
+
+def raise_obstacles(arena: Arena, key: Array, share: Float[Array, ""] | float) -> Arena:
+    """Return the room with a share of its obstacles overhead: things that the robot sees and can walk under."""
+    boxes, cylinders = len(arena.boxes.top), len(arena.cylinders.top)
+    samples = _sample_uniform(key, (boxes + cylinders, 4))
+    return dataclasses.replace(
+        arena,
+        boxes=raise_prisms(arena.boxes, samples[:boxes], share),
+        cylinders=raise_prisms(arena.cylinders, samples[boxes:], share),
     )
 
 

@@ -14,7 +14,7 @@ from reference import arena as reference
 
 from lgmdjax.errors import InputError
 from lgmdjax.simulation import room_batches
-from lgmdjax.world import arena, obstacles, scenes, variation
+from lgmdjax.world import arena, obstacles, scenes
 
 FIXED = {
     "training": scenes.training_room,
@@ -415,7 +415,7 @@ def test_too_many_prisms_are_rejected() -> None:
 def test_raised_obstacles_are_overhead_and_all_others_stay_as_they_are():
     """The share is kept over many rooms; a raised obstacle is out of the robot's reach, and no padding is raised."""
     rooms = room_batches.random_rooms(jax.random.key(5), 16).arena
-    raise_some = jax.vmap(partial(variation.raise_obstacles, share=0.25))
+    raise_some = jax.vmap(partial(scenes.raise_obstacles, share=0.25))
     raised = raise_some(rooms, jax.random.split(jax.random.key(6), 16))
     arena.validate(raised)
     counts = np.zeros(2, int)
