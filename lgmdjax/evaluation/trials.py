@@ -212,7 +212,7 @@ TRIALS: dict[str, Trial] = {
             shows="A tube 1.25 m ahead, up to 0.42 m to a side, before a white wall; below, the smallest clearance.",
             make_rooms=_tube_rooms,
             seeds=8,
-            seconds=40.0,
+            seconds=90.0,
             beyond=TUBE_DISTANCE + 0.4,
             lateral_offsets=LATERAL_OFFSETS,
         ),
