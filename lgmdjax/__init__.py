@@ -11,6 +11,7 @@
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
 | simulation, deployment, reporting, evaluation, learning, studies, pipeline, cli, runtime | what is done with them |
+| viewer | the robot in the browser |
 
 >>> import jax
 >>> import lgmdjax as lj

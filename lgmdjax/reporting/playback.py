@@ -1,0 +1,154 @@
+"""A recorded walk as arrays that can be shown at once: no JAX is imported or run to draw it.
+
+The robot's coordinates (qpos) place its limbs by C MuJoCo's kinematics. What the eyes saw and how the layers of the
+LGMDs responded is there as bytes, since to compute them takes the simulation.
+
+A file holds one walk (`save`, `load`): numbers as they are, pictures as H.264, layers compressed without loss.
+"""
+
+import io
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import av
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.reporting import video_io
+from lgmdjax.runtime import schema, storage
+
+FRAME_RATE = 30  # Hz
+LAYER_WHITE = 6.0  # grey levels of a cell that are shown as white
+JOINTS = 18
+LAYERS = ("E", "I", "S")
+
+
+class RoomShape(NamedTuple):
+    """What a room looks like, apart from where its obstacles are; boxes first, then cylinders."""
+
+    bounds: Float[ndarray, "4"]  # x_min, x_max, y_min, y_max [m]
+    wall_height: float  # m
+    half_size: Float[ndarray, "n 2"]  # m; the radius twice for a cylinder
+    yaw: Float[ndarray, " n"]  # rad
+    bottom: Float[ndarray, " n"]  # m above the floor
+    top: Float[ndarray, " n"]
+    is_round: Bool[ndarray, " n"]
+
+
+class Playback(NamedTuple):
+    """One walk, a row for each frame of 1/30 s; the names are those of `Record`."""
+
+    title: str
+    room: RoomShape
+    centres: Float[ndarray, "frames n 2"]  # m, of the obstacles; a single row if they stand still
+    time: Float[ndarray, " frames"]  # s
+    qpos: Float[ndarray, "frames 25"]
+    u: Float[ndarray, "frames 2"]
+    velocity: Float[ndarray, "frames 2"]
+    contact: Bool[ndarray, " frames"]
+    is_first: Bool[ndarray, " frames"]
+    pictures: UInt8[ndarray, "frames 2 height width"] | None = None
+    layers: UInt8[ndarray, "frames 2 3 rows columns"] | None = None  # `LAYERS`; white is `LAYER_WHITE`
+
+    def centres_at(self, frame: int) -> Float[ndarray, "n 2"]:
+        """Return where the obstacles are in a frame."""
+        return self.centres[min(frame, len(self.centres) - 1)]
+
+
+SCALARS = ("wall_height",)
+ROOM = ("bounds", "half_size", "yaw", "bottom", "top", "is_round")
+SERIES = ("time", "qpos", "u", "velocity", "contact", "is_first", "centres")
+
+
+def save(path: Path, playback: Playback) -> None:
+    """Write a walk as npz, whole or not at all; it must have pictures and layers."""
+    if playback.pictures is None or playback.layers is None:
+        raise InputError(f"{path}: expected a walk with pictures and layers, got one without; simulate it live")
+    room = {name: np.asarray(getattr(playback.room, name)) for name in (*ROOM, *SCALARS)}
+    series = {name: np.asarray(getattr(playback, name)) for name in SERIES}
+    packed = np.frombuffer(zlib.compress(playback.layers.tobytes(), 9), np.uint8)
+    content = {"layers": packed, "shape": np.asarray(playback.layers.shape), "pictures": _encode(playback.pictures)}
+    arrays = {
+        name: value.astype(np.float32) if value.dtype.kind == "f" else value
+        for name, value in {**room, **series, **content}.items()
+    }
+    storage.write_arrays(path, {**arrays, "title": np.frombuffer(playback.title.encode(), np.uint8)})
+
+
+def load(path: Path) -> Playback:
+    """Read a walk that `save` wrote; raise `InputError` for another or a damaged file."""
+    arrays = storage.read_arrays(path)
+    remedy = f"expected a walk as {__name__} writes it in {path}"
+    try:
+        frames, prisms = len(arrays["time"]), len(arrays["top"])
+        schema.check(_schema(frames, prisms), arrays, str(path), storage.REINSTALL)
+        shape = tuple(int(side) for side in arrays["shape"])
+        unpack = zlib.decompressobj()
+        layers = np.frombuffer(unpack.decompress(arrays["layers"].tobytes(), int(np.prod(shape)) + 1), np.uint8)
+        room = {name: arrays[name] for name in ROOM}
+        return Playback(
+            title=arrays["title"].tobytes().decode(),
+            room=RoomShape(**room, wall_height=float(arrays["wall_height"])),
+            **{name: arrays[name] for name in SERIES},
+            pictures=_decode(arrays["pictures"].tobytes(), frames),
+            layers=layers.reshape(shape),
+        )
+    except InputError:
+        raise
+    except Exception as error:  # whatever a damaged file makes zlib, FFmpeg and NumPy raise
+        raise InputError(f"{remedy}, got {one_line(error)[:200]}; {storage.REINSTALL}") from error
+
+
+def path_of(playback: Playback) -> list[Float[ndarray, "frames 3"]]:
+    """Return the positions [m] between a start or reset and the next, one array for each."""
+    starts = np.flatnonzero(playback.is_first)
+    return [part for part in np.split(playback.qpos[:, :3], starts[starts > 0]) if len(part) > 1]
+
+
+def contacts_of(playback: Playback) -> Sequence[int]:
+    """Return the first frame of every contact."""
+    touching = np.asarray(playback.contact, int)
+    return np.flatnonzero(np.diff(touching, prepend=0) > 0).tolist()
+
+
+def _encode(pictures: UInt8[ndarray, "frames 2 height width"]) -> UInt8[ndarray, " bytes"]:
+    """Return both eyes' pictures, side by side, as an MP4 file."""
+    side_by_side = np.concatenate([pictures[:, 0], pictures[:, 1]], axis=-1)
+    buffer = io.BytesIO()
+    with video_io.open_writer(buffer, side_by_side.shape[2], side_by_side.shape[1], FRAME_RATE) as write:
+        for picture in side_by_side:
+            write(np.repeat(picture[..., None], 3, axis=-1))
+    return np.frombuffer(buffer.getvalue(), np.uint8)
+
+
+def _decode(content: bytes, frames: int) -> UInt8[ndarray, "frames 2 height width"]:
+    with av.open(io.BytesIO(content)) as container:
+        decoded = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
+    if len(decoded) != frames:
+        raise ValueError(f"{len(decoded)} pictures of {frames} frames")
+    whole = np.stack(decoded)
+    return np.stack(np.split(whole, 2, axis=-1), axis=1)
+
+
+def _schema(frames: int, prisms: int) -> schema.Object:
+    """Return what the arrays of a file have to be."""
+
+    def numbers(*shape: int) -> schema.Numbers:
+        return schema.Numbers(shape, -1e4, 1e4)
+
+    return schema.Object(
+        {
+            "bounds": numbers(4),
+            "wall_height": numbers(),
+            "half_size": numbers(prisms, 2),
+            **{name: numbers(prisms) for name in ("yaw", "bottom", "top")},
+            "time": numbers(frames),
+            "qpos": numbers(frames, 7 + JOINTS),
+            "u": numbers(frames, 2),
+            "velocity": numbers(frames, 2),
+        }
+    )
