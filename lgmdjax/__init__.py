@@ -6,7 +6,7 @@
 | name | what |
 | --- | --- |
 | load_robot, random_rooms, rollout, run_trial | a robot, rooms, and walks of the one in the others |
-| score, plot_walks, write_video | what came of the walks: numbers, a figure, a video |
+| score, plot_walks, write_video, walk_page | what came of the walks: numbers, a figure, a video, a page in 3D |
 | Record, Room, InputError | the types that they pass and the error that they raise |
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |

@@ -25,6 +25,7 @@ from .evaluation.metrics import score as score
 from .evaluation.run_trial import run_trial as run_trial
 from .locomotion import cpg as cpg
 from .reporting.figures.trajectories import plot_walks as plot_walks
+from .reporting.walk_page import walk_page as walk_page
 from .reporting.walk_video import write_video as write_video
 from .sensors import camera as camera
 from .sensors import laser as laser

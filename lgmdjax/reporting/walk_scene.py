@@ -52,6 +52,15 @@ def quiet_server(host: str, port: int, label: str | None = None) -> "viser.Viser
     return viser.ViserServer(host=host, port=port, label=label, verbose=False)
 
 
+def _light(server: "viser.ViserServer") -> None:
+    """Light the scene without shadows and mjviser's environment map, which browsers without a GPU draw slowly."""
+    server.scene.configure_environment_map(hdri=None)
+    server.scene.configure_default_lights(enabled=False)
+    server.scene.add_light_hemisphere("/lights/sky", intensity=2.2)
+    for number, place in enumerate(((2.0, -3.0, 5.0), (-3.0, 2.0, 3.0))):
+        server.scene.add_light_directional(f"/lights/{number}", intensity=1.6 - number, position=place)
+
+
 class WalkScene:
     """The scene: one room, one robot."""
 
@@ -66,6 +75,7 @@ class WalkScene:
         self._robot.geom_groups_visible[0] = False  # the floor and the barriers of the physics
         self._robot._sync_visibilities()
         self._world = server.scene.add_frame(WORLD, show_axes=False)
+        _light(server)
         self._obstacles: dict[int, viser.MeshHandle] = {}
         self._heights: dict[int, float] = {}
         self._centres: Float[ndarray, "n 2"] = np.zeros((0, 2))

@@ -132,7 +132,7 @@ class Viewer:
         with senses.add_tab("Senses", viser.Icon.EYE):
             self.dashboard = Dashboard(self.server)
         senses.dock_left()
-        senses.set_width(430)
+        senses.set_width(410)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         self.status = gui.add_markdown("**recorded**")

@@ -38,7 +38,6 @@ def start(host: str, port: int) -> "viser.ViserServer":
     server.gui.configure_theme(
         control_width="large", show_logo=False, show_share_button=False, brand_color=(0, 90, 150)
     )
-    server.scene.configure_default_lights(cast_shadow=True)
     return server
 
 
