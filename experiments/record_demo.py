@@ -1,36 +1,30 @@
-"""Record the walk of `lgmdjax demo`: `python experiments/record_demo.py`, three minutes on 2 cores.
+"""Record the walk of `lgmdjax demo`: `python experiments/record_demo.py`, ten minutes on 2 cores.
 
-The pretrained robot walks in a random room, with the cameras of its training. Writes lgmdjax/data/demo.npz.
+The pretrained robot in the trial in which boxes move into its way, with the cameras of its training: the first 40 s of
+the first walk, in which it touches the second box. Writes lgmdjax/data/demo.npz.
 """
 
-import numpy as np
-from tqdm import tqdm
-
+from lgmdjax.evaluation import run_trial
 from lgmdjax.paths import DATA_DIR
 from lgmdjax.reporting import playback
-from lgmdjax.runtime.jax_setup import prepare_jax
+from lgmdjax.runtime.storage import write_stamp
+from lgmdjax.viewer.messages import Open
+from lgmdjax.viewer.sources import WalkSource
 
-SEED = 8  # of the room
+SEED, WALK = 31, 0
 SECONDS = 40
 
 
 def main() -> None:
-    """Simulate the walk frame by frame, as the live viewer does, and write it."""
-    prepare_jax()
-    from lgmdjax.runtime.storage import write_stamp
-    from lgmdjax.viewer.live import LiveSimulation
-    from lgmdjax.viewer.messages import Controls, Live
-
-    simulation = LiveSimulation(Live(seed=SEED), Controls(), lambda report: None)
-    room = simulation.entered()
-    frames = [simulation.advance() for _ in tqdm(range(SECONDS * playback.FRAME_RATE), desc="walk", unit="frame")]
-    series = {name: np.stack([getattr(frame, name) for frame in frames]) for name in SERIES}
-    walk = playback.Playback(title="random room", room=room.shape, centres=room.centres[None], **series)
+    """Run the trial, render what the robot saw in one of its walks, and write both."""
+    folder = run_trial.run_trial("dynamic", "learned", seed=SEED)
+    source = WalkSource(Open(folder, WALK), print)
+    frames = SECONDS * playback.FRAME_RATE
+    whole = source.sense_all(frames)
+    walk = playback.cut(whole, frames)._replace(title="Boxes move into the way")
     playback.save(DATA_DIR / "demo.npz", walk)
     write_stamp(DATA_DIR, {})
 
-
-SERIES = ("time", "qpos", "u", "velocity", "contact", "is_first", "pictures", "layers")
 
 if __name__ == "__main__":
     main()

@@ -103,6 +103,12 @@ def load(path: Path) -> Playback:
         raise InputError(f"{remedy}, got {one_line(error)[:200]}; {storage.REINSTALL}") from error
 
 
+def cut(playback: Playback, frames: int) -> Playback:
+    """Return the first frames of a walk."""
+    series = {name: getattr(playback, name) for name in (*SERIES, "pictures", "layers")}
+    return playback._replace(**{name: rows if rows is None else rows[:frames] for name, rows in series.items()})
+
+
 def path_of(playback: Playback) -> list[Float[ndarray, "frames 3"]]:
     """Return the positions [m] between a start or reset and the next, one array for each."""
     starts = np.flatnonzero(playback.is_first)

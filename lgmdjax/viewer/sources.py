@@ -28,6 +28,7 @@ import numpy as np
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import trials
 from lgmdjax.reporting import selection
+from lgmdjax.reporting.playback import Playback
 from lgmdjax.reporting.room_shape import centres_during
 from lgmdjax.reporting.walk_page import to_playback
 from lgmdjax.runtime.storage import JsonObject
@@ -95,6 +96,14 @@ class WalkSource:
         step = max(self.robot.camera.width // SHOWN_WIDTH, 1)
         pictures = np.asarray(senses.pictures)[:count, :, ::step, ::step]
         return Senses(self.index, first, pictures, np.asarray(senses.layers)[:count])
+
+    def sense_all(self, frames: int) -> Playback:
+        """Return the poses of the walk, and what the robot sensed in the first frames."""
+        parts: list[Senses] = []
+        while self.is_behind() and self.done < frames:
+            parts.append(self.sense())
+        pictures, layers = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pictures", "layers"))
+        return self.walks().playback._replace(pictures=pictures, layers=layers)
 
 
 def find_walks(path: Path) -> tuple[Path, set[int] | None]:
