@@ -105,7 +105,7 @@ class WalkScene:
             self._robot.update_from_mjdata(self.data)
             for index, handle in self._obstacles.items():
                 if np.any(centres[index] != self._centres[index]):
-                    handle.position = (*map(float, centres[index]), self._heights[index])
+                    handle.position = np.append(centres[index], self._heights[index])
         self._centres = np.array(centres)
 
     def trace(self, playback: Playback) -> None:
@@ -183,7 +183,7 @@ class WalkScene:
 
     def _draw_obstacle(self, room: RoomShape, index: int) -> None:
         bottom, top = float(room.bottom[index]), float(room.top[index])
-        dx, dy = (2 * map_ for map_ in map(float, room.half_size[index]))
+        dx, dy = (2 * room.half_size[index]).tolist()
         if room.is_round[index]:
             mesh = trimesh.creation.cylinder(radius=dx / 2, height=top - bottom, sections=40)
         else:
@@ -222,4 +222,6 @@ class WalkScene:
         if "/paths/" in name:
             path[:, 2] = LINE_HEIGHT
         segments = np.stack([path[:-1], path[1:]], axis=1)
-        self.server.scene.add_line_segments(name, points=segments, colors=colour, line_width=2.0)
+        self.server.scene.add_line_segments(
+            name, points=segments, colors=colour, thickness=2.0, thickness_units="screen"
+        )

@@ -7,7 +7,6 @@ loop of `lgmdjax.viewer.app` acts on it.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 from lgmdjax.control.names import POLICY_NAMES
 from lgmdjax.reporting.playback import Playback, contacts_of
@@ -20,7 +19,6 @@ if HAS_VISER:
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "8")
 PACES = ("0.25", "0.5", "1", "2", "4")
 MAX_MARKS = 12  # of collisions below the slider
-HandleT = TypeVar("HandleT")
 
 
 @dataclass
@@ -40,7 +38,8 @@ class Transport:
         self.folder = server.gui.add_folder("Recorded walk")
         with self.folder:
             self._title = server.gui.add_markdown("")
-            self._walk = server.gui.add_dropdown("Walk", ("0",), visible=False)
+            walks: Sequence[str] = ("0",)
+            self._walk = server.gui.add_dropdown("Walk", walks, visible=False)
             self._play = server.gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             step = server.gui.add_button_group("Step", ("-1 s", "-1 frame", "+1 frame", "+1 s"))
             speed = server.gui.add_dropdown("Speed", SPEEDS, initial_value="1")

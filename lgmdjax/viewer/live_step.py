@@ -28,6 +28,7 @@ from lgmdjax.runtime.export_cache import cached_jit
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.sensors import camera, hemifield
 from lgmdjax.simulation import closed_loop
+from lgmdjax.simulation.closed_loop import AnyArray
 from lgmdjax.viewer.messages import Controls
 from lgmdjax.world import arena
 
@@ -156,10 +157,10 @@ def _at_rest(prisms: arena.Prisms, centres: Float[Array, "n 2"]) -> arena.Prisms
 
 
 def _render_whole(
-    params: closed_loop.Params, scene: arena.Arena, position: Float[Array, "3"], quaternion: Float[Array, "4"]
+    params: closed_loop.Params, scene: arena.Arena, position: Float[AnyArray, "3"], quaternion: Float[AnyArray, "4"]
 ) -> Float[Array, "2 height width"]:
     """Render all of both pictures, also what no LGMD sees."""
-    pose = hexapod.Pose(position=position, quaternion=quaternion)
+    pose = hexapod.Pose(position=jnp.asarray(position), quaternion=jnp.asarray(quaternion))
     return closed_loop.render_stereo(replace(params.camera, overlap=1.0, ground=0.0), scene, pose)
 
 
@@ -174,7 +175,7 @@ def _to_bytes(pictures: Float[Array, "2 height width"]) -> UInt8[Array, "2 heigh
 
 
 def _layers(
-    params: lgmd.Params, before: Float[Array, "2 rows columns"], after: lgmd.State, is_first: Bool[Array, ""]
+    params: lgmd.Params, before: Float[Array, "2 rows columns"], after: lgmd.State, is_first: Bool[AnyArray, ""]
 ) -> UInt8[Array, "2 3 rows columns"]:
     """Return E, W_I |I| and S of both LGMDs (eqs. 8, 10, 11) as bytes, each eye's as it sees them.
 

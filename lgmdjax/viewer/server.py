@@ -88,7 +88,7 @@ def _refuse_other_origins(server: "viser.ViserServer", host: str) -> None:
 
     async def check(connection: object) -> None:
         peer = sockets._live_connections[connection.client_id]  # type: ignore[attr-defined]
-        headers = peer.request.headers
+        headers = peer.request.headers if peer.request is not None else {}
         if not is_own_origin(headers.get("Origin"), headers.get("Host", ""), host):
             await peer.close(POLICY_VIOLATION, "expected a page of this server")
 

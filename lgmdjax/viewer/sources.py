@@ -151,7 +151,7 @@ def room_of(parameters: JsonObject, walk: Walk, walks: int, folder: Path) -> tup
     if isinstance(live, dict):
         return edits.read_edits(live, len(walk), folder)
     room = jax.tree.map(lambda leaf: leaf[0], _rooms(parameters, walk, folder))
-    return room, centres_during(room, walk.time)
+    return room, centres_during(room, np.asarray(walk.time))
 
 
 def _rooms(parameters: JsonObject, walk: Walk, folder: Path) -> Arena:

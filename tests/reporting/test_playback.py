@@ -46,6 +46,7 @@ def test_a_file_holds_numbers_and_layers_exactly_and_pictures_nearly(walk, tmp_p
     for name, value in read.room._asdict().items():
         np.testing.assert_allclose(value, getattr(walk.room, name), rtol=1e-6)
     np.testing.assert_array_equal(read.layers, walk.layers)
+    assert read.pictures is not None
     assert np.abs(read.pictures.astype(int) - walk.pictures).mean() < 4
     assert read.title == walk.title
 

@@ -56,4 +56,4 @@ def test_bad_arguments_are_one_line(unchecked):
     record, room = synthetic.walk(2, FRAMES), synthetic.room()
     for bad in ({"index": 2}, {"seconds": 0.0}, {"seconds": 1e9}):
         with pytest.raises(InputError, match="expected"):
-            walk_page.walk_page(record, room, **bad)
+            walk_page.walk_page(record, room, **bad)  # pyright: ignore[reportArgumentType]
