@@ -1,7 +1,7 @@
 """Controls in viser's panel: for a recorded walk, and for the live simulation.
 
 Callbacks of viser run on threads of its own. They only leave a note (`Playing`, or a command for the simulator); the
-loop of `lgmdjax.viewer.app` acts on it.
+loop of `lgmdjax.viewer.page` acts on it.
 """
 
 import math
@@ -114,6 +114,7 @@ class LivePanel:
         with self.running:
             self.pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             self.step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
+            self.back = gui.add_button("Back to the recorded walk", icon=viser.Icon.ARROW_BACK)
             self._policy = gui.add_dropdown("Driver", POLICY_NAMES, initial_value="learned")
             self._threshold = gui.add_slider("T_s", 0.0, 5.0, 0.05, 0.25, hint="threshold of a cell [grey]")
             self._suppression = gui.add_slider("T_f", 0.5, 60.0, 0.1, 8.5, hint="change that suppresses u [grey]")

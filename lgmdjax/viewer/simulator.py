@@ -1,5 +1,6 @@
 """The simulator as the viewer sees it: a process that takes commands and gives reports."""
 
+import contextlib
 import os
 import pickle
 import queue
@@ -10,8 +11,8 @@ from collections.abc import Iterator
 
 from lgmdjax.viewer.messages import Command, Report, Status
 
-GRACE = 2.0  # s for the process to end by itself
-MAX_WAITING = 240  # reports that wait to be shown; then the simulator waits
+GRACE = 0.5  # s for the process to end by itself
+MAX_WAITING = 30  # reports that wait to be shown; then the simulator waits
 
 
 class Simulator:
@@ -20,16 +21,16 @@ class Simulator:
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._reports: queue.Queue[Report] = queue.Queue(MAX_WAITING)
+        self._sending = threading.Lock()
 
     def send(self, *commands: Command) -> None:
-        """Send commands; a simulator that has ended says so in a report."""
-        process = self._process or self._start()
-        try:
-            for command in commands:
-                pickle.dump(command, process.stdin)  # type: ignore[arg-type]
-            process.stdin.flush()  # type: ignore[union-attr]
-        except OSError:
-            self._reports.put(Status("the simulator ended; start it again", failed=True))
+        """Send commands, to a new process if there is none."""
+        with self._sending:
+            process = self._process if self._process is not None and self.runs else self._start()
+            with contextlib.suppress(OSError):  # the end of its output, too, says that it ended
+                for command in commands:
+                    pickle.dump(command, process.stdin)  # type: ignore[arg-type]
+                process.stdin.flush()  # type: ignore[union-attr]
 
     @property
     def runs(self) -> bool:

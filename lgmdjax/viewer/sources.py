@@ -38,12 +38,11 @@ from lgmdjax.simulation.episodes import Walk
 from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.viewer import edits, live_step
 from lgmdjax.viewer.messages import Open, Report, Senses, Status, Walks
+from lgmdjax.viewer.walk_paths import find_walks
 from lgmdjax.world.arena import Arena
 
 FRAMES_PER_CALL = 30  # rendered at once; the last call is padded
 SHOWN_WIDTH = 160  # px; wider pictures are shown at a part of their columns and rows
-FOLDERS = (".", "trial", "evaluate/testing/learned", "collect/episodes")
-"""Where a folder may have its walks; the first that has any is read."""
 
 
 class WalkSource:
@@ -104,22 +103,6 @@ class WalkSource:
             parts.append(self.sense())
         pictures, layers = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pictures", "layers"))
         return self.walks().playback._replace(pictures=pictures, layers=layers)
-
-
-def find_walks(path: Path) -> tuple[Path, set[int] | None]:
-    """Return the folder with the walks of a path, and which episodes of it are meant; None stands for all."""
-    if path.is_file():
-        if path.suffix != ".parquet":
-            raise InputError(f"expected a run, a trial or a chunk-*.parquet, got {path}; `lgmdjax trial` makes one")
-        if path.name.startswith("chunk-") and path.stem[6:].isdigit():
-            return path.parent, {int(path.stem[6:])}
-        raise InputError(f"{path}: expected the name chunk-00000.parquet that it was recorded with; rename it")
-    if not path.exists():
-        raise InputError(f"expected a run, a trial or a chunk-*.parquet, found no {path}; check the path")
-    for name in FOLDERS:
-        if any((path / name).glob("chunk-*.parquet")):
-            return path / name, None
-    raise InputError(f"expected recorded walks in {path}, found none; `lgmdjax trial indoor` makes some")
 
 
 def select(walks: list[Walk]) -> int:

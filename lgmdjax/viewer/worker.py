@@ -42,10 +42,10 @@ class Worker:
             try:
                 self._turn()
             except InputError as error:
-                self.report(Status(one_line(error), failed=True))
+                self.report(Status(one_line(error), failed=self.live is None))
             except Exception as error:  # the viewer shows it: nobody reads this process's stderr
+                self.live = self.source = None
                 self.report(Status(f"{type(error).__name__}: {one_line(error)[:300]}", failed=True))
-                self.live = None
 
     def _turn(self) -> None:
         while not self.commands.empty():
@@ -60,10 +60,12 @@ class Worker:
     def _obey(self, command: Command) -> None:
         match command:
             case Open():
-                self.live, self.source = None, WalkSource(command, self.report)
+                self.live = self.source = None
+                self.source = WalkSource(command, self.report)
                 self.report(self.source.walks())
             case Live():
-                self.source, self.live = None, LiveSimulation(command, self.controls, self.report)
+                self.live = self.source = None
+                self.live = LiveSimulation(command, self.controls, self.report)
                 self.report(self.live.entered())
             case Controls():
                 self.controls = command

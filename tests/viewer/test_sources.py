@@ -13,7 +13,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.evaluation import trials
 from lgmdjax.reporting.room_shape import centres_during, centres_of
 from lgmdjax.simulation import episodes
-from lgmdjax.viewer import sources
+from lgmdjax.viewer import sources, walk_paths
 from lgmdjax.viewer.messages import Open, Status
 
 SEED = 3
@@ -33,8 +33,8 @@ def trial(tmp_path_factory) -> Path:
 
 def test_a_trial_its_folder_and_its_file_are_the_same_walks(trial):
     expected = trial, None
-    assert sources.find_walks(trial) == sources.find_walks(trial.parent) == expected
-    assert sources.find_walks(trial / "chunk-00000.parquet") == (trial, {0})
+    assert walk_paths.find_walks(trial) == walk_paths.find_walks(trial.parent) == expected
+    assert walk_paths.find_walks(trial / "chunk-00000.parquet") == (trial, {0})
 
 
 def test_what_holds_no_walks_is_one_line(trial, tmp_path):
@@ -44,7 +44,7 @@ def test_what_holds_no_walks_is_one_line(trial, tmp_path):
     (tmp_path / "empty").mkdir()
     for name in ("nonsense.parquet", "film.mp4", "empty", "missing"):
         with pytest.raises(InputError, match=r"^[^\n]*expected [^\n]*; [^\n]*$"):
-            sources.find_walks(tmp_path / name)
+            walk_paths.find_walks(tmp_path / name)
     with pytest.raises(InputError, match="expected a whole Parquet file"):
         sources.WalkSource(Open(tmp_path / "chunk-00000.parquet"), lambda report: None)
 
