@@ -1,4 +1,4 @@
-"""Record the walk of `lgmdjax demo`: `python experiments/record_demo.py`, ten minutes on 2 cores.
+"""Record the walk of `lgmdjax demo`: `python experiments/record_demo.py`, ten minutes or less on 2 cores.
 
 The pretrained robot in the trial in which boxes move into its way, with the cameras of its training: the first 40 s of
 the first walk, in which it touches the second box. Writes lgmdjax/data/demo.npz.

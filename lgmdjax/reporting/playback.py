@@ -7,8 +7,9 @@ A file holds one walk (`save`, `load`): numbers as they are, pictures as H.264, 
 """
 
 import io
+import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from lgmdjax.runtime import schema, storage
 FRAME_RATE = 30  # Hz
 LAYER_WHITE = 6.0  # grey levels of a cell that are shown as white
 JOINTS = 18
+MAX_AXES, MAX_NUMBERS = 5, 10**8  # of an array in a file
 LAYERS = ("E", "I", "S")
 
 
@@ -59,48 +61,45 @@ class Playback(NamedTuple):
         return self.centres[min(frame, len(self.centres) - 1)]
 
 
-SCALARS = ("wall_height",)
-ROOM = ("bounds", "half_size", "yaw", "bottom", "top", "is_round")
+ROOM = ("bounds", "wall_height", "half_size", "yaw", "bottom", "top", "is_round")
 SERIES = ("time", "qpos", "u", "velocity", "contact", "is_first", "centres")
+PACKED = {"layers": np.uint8, "centres": np.float32}  # compressed without loss
 
 
 def save(path: Path, playback: Playback) -> None:
     """Write a walk as npz, whole or not at all; it must have pictures and layers."""
     if playback.pictures is None or playback.layers is None:
         raise InputError(f"{path}: expected a walk with pictures and layers, got one without; simulate it live")
-    room = {name: np.asarray(getattr(playback.room, name)) for name in (*ROOM, *SCALARS)}
-    series = {name: np.asarray(getattr(playback, name)) for name in SERIES}
-    packed = np.frombuffer(zlib.compress(playback.layers.tobytes(), 9), np.uint8)
-    content = {"layers": packed, "shape": np.asarray(playback.layers.shape), "pictures": _encode(playback.pictures)}
-    arrays = {
-        name: value.astype(np.float32) if value.dtype.kind == "f" else value
-        for name, value in {**room, **series, **content}.items()
-    }
-    storage.write_arrays(path, {**arrays, "title": np.frombuffer(playback.title.encode(), np.uint8)})
+    arrays = {name: np.asarray(getattr(playback.room, name)) for name in ROOM}
+    arrays |= {name: np.asarray(getattr(playback, name)) for name in SERIES if name not in PACKED}
+    arrays = {name: value.astype(np.float32) if value.dtype.kind == "f" else value for name, value in arrays.items()}
+    for name, dtype in PACKED.items():
+        whole = np.asarray(getattr(playback, name), dtype)
+        arrays[name] = np.frombuffer(zlib.compress(whole.tobytes(), 9), np.uint8)
+        arrays[f"{name}_shape"] = np.asarray(whole.shape)
+    title = np.frombuffer(playback.title.encode(), np.uint8)
+    storage.write_arrays(path, {**arrays, "pictures": _encode(playback.pictures), "title": title})
 
 
 def load(path: Path) -> Playback:
     """Read a walk that `save` wrote; raise `InputError` for another or a damaged file."""
     arrays = storage.read_arrays(path)
-    remedy = f"expected a walk as {__name__} writes it in {path}"
     try:
-        frames, prisms = len(arrays["time"]), len(arrays["top"])
-        schema.check(_schema(frames, prisms), arrays, str(path), storage.REINSTALL)
-        shape = tuple(int(side) for side in arrays["shape"])
-        unpack = zlib.decompressobj()
-        layers = np.frombuffer(unpack.decompress(arrays["layers"].tobytes(), int(np.prod(shape)) + 1), np.uint8)
+        frames = len(arrays["time"])
+        schema.check(_schema(frames, len(arrays["top"])), arrays, str(path), storage.REINSTALL)
         room = {name: arrays[name] for name in ROOM}
         return Playback(
             title=arrays["title"].tobytes().decode(),
-            room=RoomShape(**room, wall_height=float(arrays["wall_height"])),
-            **{name: arrays[name] for name in SERIES},
+            room=RoomShape(**{**room, "wall_height": float(arrays["wall_height"])}),
+            **{name: arrays[name] for name in SERIES if name not in PACKED},
+            **{name: _unpack(arrays, name) for name in PACKED},
             pictures=_decode(arrays["pictures"].tobytes(), frames),
-            layers=layers.reshape(shape),
         )
     except InputError:
         raise
     except Exception as error:  # whatever a damaged file makes zlib, FFmpeg and NumPy raise
-        raise InputError(f"{remedy}, got {one_line(error)[:200]}; {storage.REINSTALL}") from error
+        reason = one_line(error)[:200]
+        raise InputError(f"{path}: expected a recorded walk, got {reason}; {storage.REINSTALL}") from error
 
 
 def cut(playback: Playback, frames: int) -> Playback:
@@ -119,6 +118,15 @@ def contacts_of(playback: Playback) -> Sequence[int]:
     """Return the first frame of every contact."""
     touching = np.asarray(playback.contact, int)
     return np.flatnonzero(np.diff(touching, prepend=0) > 0).tolist()
+
+
+def _unpack(arrays: Mapping[str, ndarray], name: str) -> ndarray:
+    """Return an array that was compressed; no more memory is asked for than it says that it needs."""
+    shape, dtype = tuple(arrays[f"{name}_shape"].tolist()), np.dtype(PACKED[name])
+    if len(shape) > MAX_AXES or not 0 < math.prod(shape) <= MAX_NUMBERS:
+        raise ValueError(f"{name} of shape {shape}")
+    content = zlib.decompressobj().decompress(arrays[name].tobytes(), math.prod(shape) * dtype.itemsize)
+    return np.frombuffer(content, dtype).reshape(shape)
 
 
 def _encode(pictures: UInt8[ndarray, "frames 2 height width"]) -> UInt8[ndarray, " bytes"]:
