@@ -1,11 +1,11 @@
-# make setup | reproduce | test | coverage | docs | lint | clean   (PYTHON=... and VENV=... choose another interpreter, another place)
+# make setup | demo | reproduce | test | coverage | docs | lint | clean   (PYTHON=... and VENV=... choose another interpreter, another place)
 
 VENV ?= .venv
 SCALE ?= quick
 SEED ?= 0
 .DEFAULT_GOAL := setup
 .DELETE_ON_ERROR:
-.PHONY: setup reproduce test coverage docs lint clean lock
+.PHONY: setup demo reproduce test coverage docs lint clean lock
 
 # The first interpreter that runs and is new enough; a name alone proves nothing (version managers leave shims).
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -26,6 +26,10 @@ $(VENV)/.locked: requirements.lock
 $(VENV)/.ready: $(VENV)/.locked pyproject.toml
 	'$(VENV)/bin/python' -m pip install --quiet --no-compile --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch '$@'
+
+# The robot in the browser, until Ctrl-C.
+demo: setup
+	@'$(VENV)/bin/lgmdjax' demo
 
 reproduce: setup
 	'$(VENV)/bin/lgmdjax' reproduce --scale $(SCALE) --seed $(SEED)

@@ -6,12 +6,12 @@
 | name | what |
 | --- | --- |
 | load_robot, random_rooms, rollout, run_trial | a robot, rooms, and walks of the one in the others |
-| score, plot_walks, write_video, show_walk | what came of the walks: numbers, a figure, a video, in a notebook |
+| score, plot_walks, write_video, show_walk, walk_page | of walks: numbers, figure, video, in a notebook, in 3D |
 | Record, Room, InputError | the types that they pass and the error that they raise |
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
 | simulation, deployment, reporting, evaluation, learning | what is done with them |
-| datasets, studies, pipeline, cli, runtime | the same: walks for other libraries, questions, stages, commands, files |
+| datasets, viewer, studies, pipeline, cli, runtime | walks for other libraries, in the browser; questions, stages, commands, files |
 
 >>> import jax
 >>> import lgmdjax as lj

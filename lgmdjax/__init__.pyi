@@ -15,6 +15,7 @@ from . import runtime as runtime
 from . import sensors as sensors
 from . import simulation as simulation
 from . import studies as studies
+from . import viewer as viewer
 from . import world as world
 from .body import hexapod as hexapod
 from .control import braitenberg as braitenberg
@@ -26,6 +27,7 @@ from .evaluation.run_trial import run_trial as run_trial
 from .locomotion import cpg as cpg
 from .reporting.figures.trajectories import plot_walks as plot_walks
 from .reporting.inline_video import show_walk as show_walk
+from .reporting.walk_page import walk_page as walk_page
 from .reporting.walk_video import write_video as write_video
 from .sensors import camera as camera
 from .sensors import laser as laser

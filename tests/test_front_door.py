@@ -12,7 +12,9 @@ from test_imports import WINGS
 import lgmdjax as lj
 from lgmdjax.paths import PACKAGE_DIR
 
-FUNCTIONS = {"load_robot", "random_rooms", "rollout", "run_trial", "score", "plot_walks", "write_video", "show_walk"}
+FUNCTIONS = {
+    "load_robot", "random_rooms", "rollout", "run_trial", "score", "plot_walks", "write_video", "show_walk", "walk_page"
+}  # fmt: skip
 TYPES = {"Record", "Room", "InputError"}
 COMPONENTS = {"lgmd", "cpg", "camera", "laser", "navigator", "braitenberg", "hexapod"}
 

@@ -10,6 +10,7 @@ from lgmdjax.paths import PACKAGE_DIR
 
 WINGS = (
     "cli",
+    "viewer",
     "pipeline",
     "studies",
     "datasets",

@@ -17,7 +17,6 @@ World and trunk frames: x forward, y left, z up.
 """
 
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -29,16 +28,17 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from lgmdjax.body import implicit_step
-from lgmdjax.errors import InputError, one_line
+from lgmdjax.body.robot_xml import JOINTS as JOINTS
+from lgmdjax.body.robot_xml import LEGS as LEGS
+from lgmdjax.body.robot_xml import load as load
+from lgmdjax.body.robot_xml import xml_path as xml_path
+from lgmdjax.errors import InputError
 from lgmdjax.geometry import rotation_matrix
-from lgmdjax.paths import MJCF_DIRS
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.world import arena
 
 Tree = TypeVar("Tree")
 
-LEGS = ("left_front", "left_middle", "left_rear", "right_rear", "right_middle", "right_front")
-JOINTS = ("coxa", "femur", "tibia")
 EYES = ("eye_left", "eye_right")
 CAPSULES = ("bumper", *(f"{leg}_{part}" for leg in LEGS for part in JOINTS[1:]))  # geoms that collide with obstacles
 MIN_TRUNK_HEIGHT, MAX_TRUNK_HEIGHT = 0.04, 0.30  # m; range of the trunk of a robot that stands on its feet
@@ -64,41 +64,6 @@ class _Anatomy(NamedTuple):
     feet: np.ndarray  # (6,) ids of the geoms that stand on the floor
     barriers: np.ndarray  # (13,) ids of planes, one for each capsule
     geom_names: tuple[str, ...]  # all geoms
-
-
-def xml_path() -> Path:
-    """Return the path of the robot's XML: in the installed package, or next to it in a checkout."""
-    for folder in MJCF_DIRS:
-        if (folder / "hexapod.xml").is_file():
-            return folder / "hexapod.xml"
-    raise InputError(f"expected hexapod.xml in {' or '.join(map(str, MJCF_DIRS))}, got none; reinstall lgmdjax")
-
-
-def load(path: Path | str | None = None) -> mujoco.MjModel:
-    """Load the robot for C MuJoCo: the package's, or a variant with the same names from the file `path`.
-
-    >>> load().nu  # servos
-    18
-    """
-    path = xml_path() if path is None else Path(path)
-    if not path.is_file():
-        raise InputError(
-            f"expected a robot's XML file, got {path}, which does not exist; give the path of a hexapod.xml"
-        )
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise InputError(
-            f"expected a MuJoCo model in {path}, got one that does not compile ({one_line(error)}); correct it"
-        ) from None
-    servos = [model.actuator(i).name for i in range(model.nu)]
-    expected = [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS]
-    if servos != expected:
-        raise InputError(
-            f"expected {len(expected)} servos {expected[0]} ... {expected[-1]} in {path}, got {len(servos)}"
-            f" ({', '.join(servos[:3])} ...); start from the hexapod.xml of this package"
-        )
-    return model
 
 
 def build(model: mujoco.MjModel | None = None) -> mjx.Model:

@@ -28,7 +28,7 @@ from lgmdjax.evaluation.clip_responses import Clip, Trace
 from lgmdjax.reporting import clip_page
 from lgmdjax.reporting.figures import clip_scores as figure
 from lgmdjax.reporting.figures import style
-from lgmdjax.runtime import storage, versions
+from lgmdjax.runtime import partial_files, storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
 SCALES = {"own": "u", "adapted": "adapted"}  # name in scores.json, and in `Trace`
@@ -52,7 +52,7 @@ def run_clips(flags: BenchFlags) -> Iterator[str]:
         rows.append(score(name, clips, traces[name]))
         yield _line(rows[-1])
     out = flags.out / f"clips-{folder.resolve().name}"
-    with storage.replacing_all(out) as partial:
+    with partial_files.replacing_all(out) as partial:
         storage.write_json(partial / "scores.json", rows)
         (partial / "scores.md").write_text(table(rows), encoding="utf-8")
         with (partial / "responses.csv").open("wb") as file:

@@ -200,6 +200,34 @@ class DatasetFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DemoFlags:
+    """Where the page is served."""
+
+    host: str = "127.0.0.1"
+    """address to listen on; the default is reached from this machine alone"""
+    port: int = 8080
+    """port to listen on; 0 takes a free one"""
+    browser: bool = True
+    """open the page in a browser"""
+    out: Path = Path("runs/view")
+    """folder that holds what is recorded in the browser"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewFlags(DemoFlags):
+    """What is shown, and where the page is served."""
+
+    path: tyro.conf.Positional[Path | None] = None
+    """run folder, folder of a trial, or chunk-*.parquet; a live simulation if left out"""
+    run: Path | None = None
+    """run folder of the robot that is simulated live; the pretrained robot if left out"""
+    room: Literal["random"] | TrialName = "random"
+    """room of the live simulation: random, or that of a trial"""
+    seed: int = 0
+    """seed of the room of the live simulation"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorFlags:
     """The folder that is checked."""
 

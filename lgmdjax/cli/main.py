@@ -24,7 +24,7 @@ from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import prepare_jax
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
-NOT_RESUMED = ("watch", "export", "export-dataset", "bench", "doctor")
+NOT_RESUMED = ("watch", "export", "export-dataset", "bench", "demo", "view", "doctor")
 ALARM_CODE = 3  # exit code of `lgmdjax watch --alarm.exit-code` after an alarm
 MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
@@ -136,6 +136,26 @@ def bench(arguments: Sequence[str]) -> None:
         print(line, flush=True)
 
 
+def demo(arguments: Sequence[str]) -> None:
+    """Show the pretrained robot in the browser: a recorded walk at once, a live simulation on request."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse(flags.DemoFlags(), "demo", _summary(demo), arguments)
+    from lgmdjax.cli.view import show_demo
+
+    show_demo(given)
+
+
+def view(arguments: Sequence[str]) -> None:
+    """Show recorded walks in the browser, or simulate a robot live in a room whose obstacles can be moved."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse(flags.ViewFlags(), "view", _summary(view), arguments)
+    from lgmdjax.cli.view import show_walks
+
+    show_walks(given)
+
+
 def doctor(arguments: Sequence[str]) -> int:
     """Check this machine: versions, devices, arithmetic, physics, video, disk; exit code 1 after a FAIL."""
     from lgmdjax.cli import flags
@@ -159,6 +179,8 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "export": export,
     "export-dataset": export_dataset,
     "bench": bench,
+    "demo": demo,
+    "view": view,
     "doctor": doctor,
 }
 

@@ -8,6 +8,7 @@ The results are in a folder with the names of the trial, the policy and the seed
 | chunk-*.parquet | the recorded walks of one batch each (`lgmdjax.simulation.episodes`) |
 | paths.png       | paths seen from above                                                |
 | walk.mp4        | video of the most eventful walk                                      |
+| walk.html       | the same in 3D, where the extra `viewer` is installed                |
 
 After an interruption the same call continues with the next batch.
 """
@@ -25,7 +26,7 @@ from lgmdjax.control.names import PolicyName
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import metrics, trials
 from lgmdjax.evaluation.settings import TrialName
-from lgmdjax.reporting import walk_video
+from lgmdjax.reporting import walk_page, walk_video
 from lgmdjax.reporting.figures import style, trajectories
 from lgmdjax.runtime import storage
 from lgmdjax.runtime.run_folders import Stage, execute, open_run
@@ -184,3 +185,5 @@ def _write_results(folder: Path, trial_run: TrialRun, robot: closed_loop.Params,
     storage.write_json(folder / "outcome.json", summarise(trial, record))
     (folder / "paths.png").write_bytes(style.to_png(plot_trial(trial, rooms, record)))
     walk_video.write_video(folder / "walk.mp4", record, rooms, robot, seconds=VIDEO_SECONDS)
+    if walk_page.HAS_VISER:
+        walk_page.walk_page(record, rooms, seconds=VIDEO_SECONDS).write(folder / "walk.html")

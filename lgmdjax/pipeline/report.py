@@ -30,13 +30,15 @@ from lgmdjax.paths import PACKAGE_DIR
 from lgmdjax.pipeline import report_data, report_figures
 from lgmdjax.pipeline.report_figures import NOMINAL_SPEED, TITLES, VARIANTS
 from lgmdjax.pipeline.settings import ReportSettings
-from lgmdjax.reporting import walk_video
+from lgmdjax.reporting import walk_page, walk_video
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import partial_files
 from lgmdjax.runtime.storage import JsonObject, read_arrays, read_file
+from lgmdjax.simulation.closed_loop import Record
 from lgmdjax.studies import supervision, velocity
 from lgmdjax.world import arena, scenes
 
+WALK_PAGE, WALK_SECONDS = "walk.html", 30.0  # beside index.html, and how much of the walk it shows
 MINUS = "\N{MINUS SIGN}"
 INPUTS = {  # of the policies
     "teacher": "laser scanner",
@@ -48,7 +50,10 @@ INPUTS = {  # of the policies
 
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: ReportSettings, seed: int) -> None:
-    """Write index.html from the folders of all earlier stages."""
+    """Write index.html from the folders of all earlier stages, and walk.html where the extra `viewer` is installed."""
+    if walk_page.HAS_VISER:
+        walk = Record(**read_arrays(folder.parent / "evaluate/walk.npz"))
+        walk_page.walk_page(walk, scenes.testing_room(), seconds=WALK_SECONDS).write(folder / WALK_PAGE)
     render(folder.parent, folder, video_seconds=settings.video_seconds)
 
 
@@ -70,14 +75,15 @@ def render(
     Raises InputError if a file is missing or cannot be read; the message names the stage that makes it.
     """
     room = scenes.testing_room() if room is None else room
+    out = run_folder / "report" if out is None else out
     page = _environment().get_template("report.html.j2")
+    walk_link = WALK_PAGE if (out / WALK_PAGE).is_file() else None
     try:
-        text = page.render(**_contents(run_folder, room, video_seconds))
+        text = page.render(**_contents(run_folder, room, video_seconds), walk_page=walk_link)
     except (KeyError, jinja2.UndefinedError) as error:
         raise InputError(
             f"expected a run folder of this version of lgmdjax, {run_folder} lacks {error}; delete it and run again"
         ) from error
-    out = run_folder / "report" if out is None else out
     out.mkdir(parents=True, exist_ok=True)
     path = out / "index.html"
     with partial_files.replacing(path) as partial:

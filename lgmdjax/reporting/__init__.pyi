@@ -2,10 +2,14 @@ from . import clip_page as clip_page
 from . import figures as figures
 from . import inline_video as inline_video
 from . import lgmd_overlay as lgmd_overlay
+from . import playback as playback
+from . import room_shape as room_shape
 from . import selection as selection
 from . import third_person as third_person
 from . import video_geometry as video_geometry
 from . import video_io as video_io
 from . import video_source as video_source
 from . import video_timing as video_timing
+from . import walk_page as walk_page
+from . import walk_scene as walk_scene
 from . import walk_video as walk_video

@@ -86,6 +86,7 @@ class _Views(NamedTuple):
     ends: Array
     eye_positions: Array
     eye_rotations: Array
+    room: arena.Arena
 
 
 def write_video(
@@ -145,16 +146,16 @@ def write_trace(
     Args:
         target: path of the file, or a binary stream.
         trace: the walk.
-        room: the room of the walk.
+        room: the room of the walk, or a batch with the room of each frame.
         eyes: camera of the eyes. Images are rendered in full width, and dimmed where the LGMDs do not see them.
         seconds: duration of the video; it is shorter if the walk is.
     """
     _check(trace)
     frames = selection.select_segment(trace.position, trace.velocity, round(seconds * VIDEO_RATE) * FRAME_STRIDE)
-    views, robot = _views(trace, frames[::FRAME_STRIDE])
+    views, robot = _views(trace, room, frames[::FRAME_STRIDE])
     page = _Page(trace, frames, (eyes.width, eyes.height))
     with video_io.open_writer(target, *VIDEO_SIZE, VIDEO_RATE) as write:
-        for index, (view, eye_images) in enumerate(_render(views, robot, room, eyes)):
+        for index, (view, eye_images) in enumerate(_render(views, robot, eyes)):
             write(page.compose(view, eye_images, frames[index * FRAME_STRIDE], eyes))
     return len(views.time)
 
@@ -171,8 +172,9 @@ def _check(trace: WalkTrace) -> None:
             )
 
 
-def _views(trace: WalkTrace, rows: Int[ndarray, " n"]) -> tuple[_Views, RobotCapsules]:
-    """Compute the poses of cameras, eyes and limbs in the chosen frames."""
+def _views(trace: WalkTrace, room: arena.Arena, rows: Int[ndarray, " n"]) -> tuple[_Views, RobotCapsules]:
+    """Compute the poses of cameras, eyes and limbs in the chosen frames, and their rooms."""
+    to_single = partial(jnp.asarray, dtype=jnp.float32)
     position, heading = _smooth(trace)
     forward = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)[rows]
     target = position[rows]
@@ -188,8 +190,16 @@ def _views(trace: WalkTrace, rows: Int[ndarray, " n"]) -> tuple[_Views, RobotCap
         ends=to_single(body.ends),
         eye_positions=to_single(body.eye_positions),
         eye_rotations=to_single(body.eye_rotations),
+        room=_rooms(room, rows),
     )
     return views, RobotCapsules(views.starts[0], views.ends[0], to_single(body.radii), to_single(body.colours))
+
+
+def _rooms(room: arena.Arena, rows: Int[ndarray, " n"]) -> arena.Arena:
+    """Return the room of each of the chosen frames, in single precision."""
+    if np.ndim(room.bounds) == 1:
+        rows, room = np.zeros_like(rows), jax.tree.map(lambda leaf: np.asarray(leaf)[None], room)
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rows], jnp.float32), room)
 
 
 def _smooth(trace: WalkTrace) -> tuple[Float[ndarray, "frames 3"], Float[ndarray, " frames"]]:
@@ -237,16 +247,15 @@ def body_geometry(qpos: Float[ndarray, "n 25"]) -> BodyGeometry:
 
 
 def _render(
-    views: _Views, robot: RobotCapsules, room: arena.Arena, eyes: camera.Params
+    views: _Views, robot: RobotCapsules, eyes: camera.Params
 ) -> Iterator[tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "2 rows columns"]]]:
     """Render the views in chunks of one size, two at a time; the last chunk is padded."""
     count = len(views.time)
     render = _renderer(third_person.Params(), replace(eyes, overlap=1.0, ground=0.0))
-    room = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), room)
 
     def render_chunk(first: int) -> tuple[ndarray, ndarray]:
         rows = np.minimum(np.arange(first, first + IMAGES_PER_CALL), count - 1)
-        view, eye_images = render(jax.tree.map(lambda leaf: leaf[rows], views), robot, room)
+        view, eye_images = render(jax.tree.map(lambda leaf: leaf[rows], views), robot)
         return np.asarray(view)[: count - first], np.asarray(eye_images)[: count - first]
 
     with ThreadPoolExecutor(2) as pool:
@@ -256,18 +265,18 @@ def _render(
 
 def _renderer(
     params: third_person.Params, eyes: camera.Params
-) -> Callable[[_Views, RobotCapsules, arena.Arena], tuple[Array, Array]]:
+) -> Callable[[_Views, RobotCapsules], tuple[Array, Array]]:
     """Compile the rendering of a chunk: third-person images (n, h, w, 3) and images of both eyes (n, 2, h, w)."""
 
-    def render(robot: RobotCapsules, room: arena.Arena, view: _Views) -> tuple[Array, Array]:
-        scene = arena.at_time(room, view.time)
+    def render(robot: RobotCapsules, view: _Views) -> tuple[Array, Array]:
+        scene = arena.at_time(view.room, view.time)
         posed = robot._replace(starts=view.starts, ends=view.ends)
         viewpoint = Viewpoint(view.camera_position, view.camera_rotation)
         image = third_person.render_view(params, scene, viewpoint, posed, view.target)
         eye_images = camera.render(eyes, scene, view.eye_positions, view.eye_rotations)
         return (255 * image).astype(jnp.uint8), jnp.clip(eye_images, 0, 255).astype(jnp.uint8)
 
-    return jax.jit(lambda views, robot, room: jax.lax.map(partial(render, robot, room), views))
+    return jax.jit(lambda views, robot: jax.lax.map(partial(render, robot), views))
 
 
 class _Page:

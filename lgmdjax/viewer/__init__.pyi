@@ -1,0 +1,13 @@
+from . import app as app
+from . import controls as controls
+from . import dashboard as dashboard
+from . import edits as edits
+from . import live as live
+from . import live_step as live_step
+from . import messages as messages
+from . import page as page
+from . import server as server
+from . import simulator as simulator
+from . import sources as sources
+from . import walk_paths as walk_paths
+from . import worker as worker
