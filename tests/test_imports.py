@@ -15,6 +15,7 @@ WINGS = (
     "learning",
     "evaluation",
     "reporting",
+    "transfer",
     "deployment",
     "simulation",
     "control",

@@ -28,6 +28,7 @@ from lgmdjax.studies.settings import (
     OverlapSettings,
     SensitivitySettings,
     SupervisionSettings,
+    TransferSettings,
     VelocitySettings,
 )
 
@@ -44,6 +45,7 @@ StudySettings = (
     | LgmdGradientSettings
     | GradientHorizonSettings
     | FinetuneSettings
+    | TransferSettings
 )
 
 _FIELD: Mapping[str, float] = {"ground": 0.5, "falloff": 2.0}  # of the LGMDs (`lgmdjax.sensors.settings`)
@@ -168,5 +170,6 @@ STUDY_PRESETS: Mapping[str, StudySettings] = {
         clip=10.0,
         seeds=3,
     ),
+    "transfer": TransferSettings(),
 }
 """Settings of the studies that are no stages of a run."""

@@ -23,7 +23,6 @@ Of `together` a robot has all.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -32,11 +31,8 @@ from jaxtyping import Array, Float
 
 from lgmdjax.body import servo_faults
 from lgmdjax.sensors import camera_faults
+from lgmdjax.transfer.names import FaultName
 
-FaultName = Literal[
-    "noise", "exposure", "vignetting", "blur", "jpeg", "drops", "latency", "rate", "lens", "turn", "gains",
-    "backlash", "delay", "friction", "payload",
-]  # fmt: skip
 FRAME_RATE, SLOW_RATE = 30.0, 25.0  # Hz
 
 
@@ -133,7 +129,6 @@ FAULTS: Mapping[FaultName, Callable[[Faults, Array], Faults]] = {
     "friction": _friction,
     "payload": _payload,
 }
-TOGETHER: tuple[FaultName, ...] = tuple(FAULTS)
 
 
 def draw(key: Array, *names: FaultName) -> Faults:

@@ -27,10 +27,10 @@ from lgmdjax.sensors import laser
 from lgmdjax.simulation import closed_loop
 from lgmdjax.simulation.assembly import select_policy
 from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS, Record, Room
-from lgmdjax.transfer import faults as faults_module
 from lgmdjax.transfer import nerves, robot_model
 from lgmdjax.transfer.cube_camera import CubeCamera
-from lgmdjax.transfer.faults import FaultName, Faults
+from lgmdjax.transfer.faults import Faults, draw
+from lgmdjax.transfer.names import FaultName
 from lgmdjax.world import arena, mujoco_world
 from lgmdjax.world.mujoco_world import Style
 
@@ -44,7 +44,7 @@ class World:
 
     style: Style = Style()
     faults: tuple[FaultName, ...] = ()
-    own_engine_seed: int = 0  # of textures, shapes and faults
+    seed: int = 0  # of textures, shapes and faults
 
 
 class _Body(NamedTuple):
@@ -67,9 +67,7 @@ def walk(
     All robots of a call are walked side by side, so that one call of the nervous system serves all.
     """
     count = len(rooms.starts)
-    drawn = [
-        faults_module.draw(jax.random.fold_in(key, world.own_engine_seed), *world.faults) for key in _keys(rooms, count)
-    ]
+    drawn = [draw(jax.random.fold_in(rooms.key[k], world.seed), *world.faults) for k in range(count)]
     bodies = [_body(jax.tree.map(lambda leaf, k=k: leaf[k], rooms), drawn[k], world, k) for k in range(count)]
     chosen = policies.get_policy(policy)
     with ExitStack() as stack:
@@ -77,9 +75,9 @@ def walk(
             stack.enter_context(CubeCamera(body.model, robot.camera, lens=own.lens))
             for body, own in zip(bodies, drawn if chosen.uses_camera else [], strict=False)
         ]
-        batch = _Batch(select_policy(_single(robot), chosen), bodies, cameras, _stack(drawn), rooms.key)
+        batch = _Batch(select_policy(_in_single_precision(robot), chosen), bodies, cameras, _stack(drawn), rooms.key)
         frames = round(seconds * FRAME_RATE)
-        rows = [row for row in tqdm(batch.frames(frames), total=frames, desc=label or policy, unit="frame")]
+        rows = list(tqdm(batch.frames(frames), total=frames, desc=label or policy, unit="frame", mininterval=2.0))
     return Record(**{f.name: np.stack([row[f.name] for row in rows], axis=1) for f in fields(Record)})
 
 
@@ -114,17 +112,14 @@ class _Batch:
                 if int(substep / period) > int((substep - 1) / period) or substep == 0:
                     self._look()
                 touched |= self._move()
-            self.contact = touched
+            self.contact, self.is_first = touched, np.zeros(len(touched), bool)
             yield row | self._outcome(touched)
 
     def _lift(self) -> None:
         """Put robots that touched something at their next start."""
-        lifted, self.is_first = self.contact & self.ok, self.is_first & False
-        if not self.resets.any() and not lifted.any() and not hasattr(self, "started"):
-            self.is_first, self.started = np.ones(len(lifted), bool), True
+        lifted = self.contact & self.ok
         if lifted.any():
-            self.resets = self.resets + lifted
-            self.is_first = lifted.copy()
+            self.resets, self.is_first = self.resets + lifted, self.is_first | lifted
             keys = jax.vmap(jax.random.fold_in)(self.keys, jnp.asarray(self.resets))
             self.states = nerves.restart_batch(self.robot, self.faults, self.states, keys, jnp.asarray(lifted))
             for index in np.flatnonzero(lifted):
@@ -199,17 +194,21 @@ def is_healthy(data: mujoco.MjData) -> bool:
     """Return whether the state is finite and the robot on its feet, as `hexapod.is_healthy` does."""
     height, (x, y) = data.qpos[2], data.qpos[4:6]
     upright = 1 - 2 * (x * x + y * y) > hexapod.MIN_UPRIGHT
-    return bool(upright and hexapod.MIN_TRUNK_HEIGHT < height < hexapod.MAX_TRUNK_HEIGHT and np.isfinite(data.qvel).all())
+    return bool(
+        upright and hexapod.MIN_TRUNK_HEIGHT < height < hexapod.MAX_TRUNK_HEIGHT and np.isfinite(data.qvel).all()
+    )
 
 
 def _body(room: Room, faults: Faults, world: World, index: int) -> _Body:
-    model = robot_model.build(room.arena, world.style, seed=world.own_engine_seed + index)
+    model = robot_model.build(room.arena, world.style, seed=world.seed + index)
     model = servo_faults.apply_to_model(model, faults.body)
     data, starts = mujoco.MjData(model), np.asarray(room.starts, float)
     robot_model.reset(model, data, starts[0])
     touchable = mujoco_world.touchable(model)
     capsules = np.array([model.geom(name).id for name in hexapod.CAPSULES])
-    return _Body(model, data, jax.tree.map(np.asarray, room.arena), starts, touchable, capsules, np.flatnonzero(touchable))
+    return _Body(
+        model, data, jax.tree.map(np.asarray, room.arena), starts, touchable, capsules, np.flatnonzero(touchable)
+    )
 
 
 def _clearance(body: _Body) -> float:
@@ -221,17 +220,15 @@ def _clearance(body: _Body) -> float:
     return nearest
 
 
-def _keys(rooms: Room, count: int) -> list[jax.Array]:
-    return [rooms.key[index] for index in range(count)]
-
-
-def _single(robot: closed_loop.Params) -> closed_loop.Params:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating) else jnp.asarray(leaf), robot)
+def _in_single_precision(robot: closed_loop.Params) -> closed_loop.Params:
+    return jax.tree.map(_narrow, robot)
 
 
 def _stack(drawn: Sequence[Faults]) -> Faults:
-    def stack(*leaves: object) -> np.ndarray:
-        values = np.stack([np.asarray(leaf) for leaf in leaves])
-        return values.astype(np.float32) if values.dtype.kind == "f" else values.astype(np.int32)
+    return jax.tree.map(lambda *leaves: _narrow(np.stack([np.asarray(leaf) for leaf in leaves])), *drawn)
 
-    return jax.tree.map(stack, *drawn)
+
+def _narrow(leaf: jax.Array | np.ndarray | float) -> np.ndarray:
+    """Return an array in single precision, so that one compiled program serves both settings of JAX."""
+    array = np.asarray(leaf)
+    return array.astype({"f": np.float32, "i": np.int32}.get(array.dtype.kind, array.dtype))

@@ -31,6 +31,7 @@ MIN_HALF_WIDTH = 0.175  # m; a sphere of this radius is as high as the robot (`a
 SEAT_HEIGHT, SLAT_RADIUS, SLAT_SPACING = 0.45, 0.018, 0.09  # m, of a chair
 TILES = (0.7, 1.4)  # m, range of the widths of a texture
 LAMP, FILL, AMBIENT = 0.5, 0.3, 0.6  # grey of a white surface that faces the lamp, or the light without shadows
+SHADOW_MAP = 256  # px over the room; each doubling doubles the time that a picture takes
 LAMP_DIRECTION, FILL_DIRECTION = (0.45, 0.3, -1.0), (-0.6, -0.5, -0.7)
 
 
@@ -118,7 +119,7 @@ def _light(spec: mujoco.MjSpec, room: Arena, style: Style) -> None:
     spec.stat.extent, spec.stat.center = 1.0, [0.0, 0.0, 0.0]
     spec.visual.map.znear, spec.visual.map.zfar, spec.visual.map.shadowclip = 0.004, 60.0, half + 1.0
     quality = spec.visual.quality
-    quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks = 512, 0, 12, 6
+    quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks = SHADOW_MAP, 0, 8, 4
     if style.shadows:
         lamps = ((LAMP_DIRECTION, LAMP, True), (FILL_DIRECTION, FILL, False))
         for direction, grey, casts in lamps:
