@@ -10,7 +10,8 @@
 | Record, Room, InputError | the types that they pass and the error that they raise |
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
-| simulation, deployment, transfer, reporting, evaluation, learning, studies, pipeline, cli, runtime | what is done with them |
+| simulation, deployment, transfer, reporting, evaluation, learning | what is done with them |
+| studies, pipeline, cli, runtime | the same from the command line |
 
 >>> import jax
 >>> import lgmdjax as lj

@@ -39,8 +39,8 @@ def prepare_jax() -> None:
 def prepare_opengl() -> None:
     """Set the variables by which MuJoCo finds OpenGL without a window, before MuJoCo is imported.
 
-    On Linux without a screen that is EGL, or OSMesa where there is no EGL. Mesa's software renderer gets no threads: for
-    pictures of a hundred pixels they cost five times what they save.
+    On Linux without a screen that is EGL, or OSMesa where there is no EGL. Mesa's software renderer gets no threads,
+    which for pictures of a hundred pixels cost five times what they save.
     """
     _set_default("LP_NUM_THREADS", "0")
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

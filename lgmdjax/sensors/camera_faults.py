@@ -4,20 +4,20 @@ A picture passes, in this order, vignetting, motion blur, automatic exposure, no
 bits, and JPEG; then it may be dropped, and it arrives late. Without a fault, `step` returns the picture unchanged, but
 rounded. All numbers are arrays, so that `vmap` gives each robot of a batch its own camera.
 
-| symbol | name                                              | unit       | where                                         |
-| ------ | ------------------------------------------------- | ---------- | --------------------------------------------- |
-| L      | picture                                           | grey       | 0..255                                        |
-| rho    | distance of a pixel from the middle               | 1          | 1 at the middle of the left and right edge    |
-| c      | loss of light                                     | 1          | L (1 - c min(rho, 1)^2)                       |
-| s      | open part of the frame interval                   | 1          | L - s/2 (L - previous L), the picture as      |
-|        |                                                   |            | linear in time                                |
-| g      | logarithm of the gain of the exposure             | 1          | dg = w (a - log mean L/M - g) + drift         |
-| e, r   | electrons a grey level, read noise                | 1/grey, 1  | variance L/e + (r/e)^2                        |
-| gamma  | of the sensor                                     | 1          | 255 (L/255)^gamma                             |
-| q      | quality of JPEG                                   | 1..100     | tables of ITU-T T.81, annex K, libjpeg's scale |
+| symbol | name                                            | unit      | where                                        |
+| ------ | ----------------------------------------------- | --------- | -------------------------------------------- |
+| L      | picture                                         | grey      | 0..255                                       |
+| rho    | distance of a pixel from the middle             | 1         | 1 at the left and right edge                 |
+| c      | loss of light                                   | 1         | L (1 - c min(rho, 1)^2)                      |
+| s      | open part of the frame interval                 | 1         | L - s/2 (L - previous L): linear in time     |
+| g      | logarithm of the gain of the exposure           | 1         | g += w (a - log(mean L / M) - g)             |
+| a      | its aim, which drifts (Ornstein-Uhlenbeck)      | 1         |                                              |
+| e, r   | electrons a grey level, read noise              | 1/grey, 1 | variance L/e + (r/e)^2                       |
+| gamma  | of the sensor                                   | 1         | 255 (L/255)^gamma                            |
+| q      | quality of JPEG                                 | 1..100    | steps of ITU-T T.81, scaled as libjpeg does  |
 
-Lens and pose of an eye are no operation on a picture, since what they bring into view was not there: `Lens` is for those
-who cast the rays, and `warp` approximates its distortion on a picture.
+Lens and pose of an eye are no operation on a picture, since what they bring into view is not in it: `Lens` is for
+those who cast the rays, and `warp` approximates its distortion on a picture.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,8 @@
 """Does the trained robot avoid obstacles in a world that nothing was trained in, and which fault stops it?
 
-The robot is unchanged. In the other world C MuJoCo computes its contacts, with the true shapes and hard, OpenGL draws its
-pictures, surfaces are photographs or 1/f noise under a lamp that casts shadows, and some obstacles are spheres, chairs
-or rocks (`lgmdjax.transfer`). Rooms, starts and measures are those of our own world.
+The robot is unchanged. In the other world C MuJoCo computes hard contacts of true shapes, OpenGL draws the pictures,
+surfaces are photographs or 1/f noise under a lamp that casts shadows, and some obstacles are spheres, chairs or rocks
+(`lgmdjax.transfer`). Rooms, starts and measures are those of our own world.
 
 | world  | what it is                                                                                |
 | ------ | ----------------------------------------------------------------------------------------- |
@@ -11,9 +11,9 @@ or rocks (`lgmdjax.transfer`). Rooms, starts and measures are those of our own w
 | other  | the same with obstacles of other shapes                                                   |
 | faults | the other world, and a robot with one fault (`lgmdjax.transfer.faults`), or all `together` |
 
-Teacher and blind walk in own, other, and with all faults together; learned in every world. Writes transfer.json, a row for
-each world, trial and policy: its metrics, or the outcome in a scene. Walks are kept in Parquet, row by row, so that an
-interrupted study carries on.
+Teacher and blind walk in own, other, and with all faults together; learned in every world. Writes transfer.json, a row
+for each world, trial and policy: its metrics, or the outcome in a scene. Walks are kept in Parquet, row by row, so that
+an interrupted study carries on.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,9 +1,9 @@
 """The stereo fisheye camera by OpenGL: faces of a cube around each eye, averaged over the area of the fisheye's pixels.
 
 OpenGL draws pinhole pictures. Five faces of a cube, 90 degrees each, see all but what is behind. A pixel of the fisheye
-is the mean over `RAYS` x `RAYS` rays within its area, each of which reads the pixel of the face that it hits: one sparse
-matrix, made once. Faces that no pixel of the eye's hemifield meets are not drawn: three of five where the detectors
-look above the horizon.
+is the mean over `RAYS` x `RAYS` rays within its area, each of which reads the pixel of the face that it hits: one
+sparse matrix, made once. Faces that no pixel of the eye's hemifield meets are not drawn: two of five where the
+detectors look above the horizon.
 
 | symbol | name                                  | unit | where                             |
 | ------ | ------------------------------------- | ---- | --------------------------------- |

@@ -1,7 +1,7 @@
-"""The nervous systems of a batch of robots, in the two rates of a real one: by the picture, and by the servo's set point.
+"""The nervous systems of a batch of robots, in the two rates of a real one: of pictures, and of the servos' set points.
 
-`see` is what a picture causes, `move` what happens 180 times a second whether or not a picture came. Both are composed of
-the functions of `lgmdjax.control.controller`, as the closed loop of MJX and `deployment.nervous_system` are: with a
+`see` is what a picture causes, `move` what happens 180 times a second whether or not a picture came. Both are composed
+of the functions of `lgmdjax.control.controller`, as the closed loop of MJX and `deployment.nervous_system` are: with a
 picture before every sixth set point, they are the same system.
 """
 
@@ -103,7 +103,7 @@ def move(params: closed_loop.Params, faults: Faults, state: State) -> tuple[Stat
 
 
 def restart(params: closed_loop.Params, faults: Faults, state: State, key: Array, lifted: Bool[Array, ""]) -> State:
-    """Return the state of a robot after its reset if it was `lifted`: a new policy's state, no picture; the CPG goes on."""
+    """Return the state after a reset if the robot was `lifted`: that of a start, but the CPG goes on."""
     started = init(params, faults, key)
     started = replace(started, controller=replace(started.controller, cpg=state.controller.cpg))
     return _where(lifted, started, state)

@@ -1,7 +1,7 @@
 """The robot in a room, for C MuJoCo: its true geoms collide, with MuJoCo's default contacts, and it has cube cameras.
 
-In `mjcf/hexapod.xml` feet collide with the floor and a few enlarged shapes with barriers, as MJX needs it. Here barriers
-and explicit pairs are left out, and every geom of the robot that has been drawn collides with floor, walls and
+In `mjcf/hexapod.xml` feet collide with the floor, and a few enlarged shapes with barriers, as MJX needs it. Here
+barriers and explicit pairs are left out, and every geom of the robot that is drawn collides with floor, walls and
 obstacles: hard contacts, with the friction of the geoms.
 """
 
@@ -12,12 +12,12 @@ from lgmdjax.body import hexapod
 from lgmdjax.transfer import cube_camera
 from lgmdjax.world import mujoco_world
 from lgmdjax.world.arena import Arena
-from lgmdjax.world.mujoco_world import ROBOT, WORLD, Style
+from lgmdjax.world.mujoco_world import PHOTOGRAPHIC, ROBOT, WORLD, Style
 
 DRAWN = 2  # group of the robot's geoms in the XML
 
 
-def build(room: Arena, style: Style = Style(), *, seed: int = 0, face: int = cube_camera.FACE) -> mujoco.MjModel:
+def build(room: Arena, style: Style = PHOTOGRAPHIC, *, seed: int = 0, face: int = cube_camera.FACE) -> mujoco.MjModel:
     """Return the robot's model with a single room around it.
 
     Args:

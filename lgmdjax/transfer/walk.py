@@ -1,8 +1,8 @@
 """Walks of a batch of robots in C MuJoCo, with pictures by OpenGL: the same record as the closed loop of MJX gives.
 
-The order is that of a real robot. 180 times a second CPG, servos and physics advance, whether or not a picture came. 30 or
-25 times a second the cameras take a picture; when one arrives (`camera_faults`), detectors and policy work on it. After
-a touch the robot is lifted to its next start, at the next thirtieth of a second, as in `simulation.closed_loop`.
+The order is that of a real robot. 180 times a second CPG, servos and physics advance, whether or not a picture came. 30
+or 25 times a second the cameras take a picture; when one arrives (`camera_faults`), detectors and policy work on it.
+After a touch the robot is lifted to its next start, at the next thirtieth of a second, as in `simulation.closed_loop`.
 
 A touch is a contact of any of the robot's geoms with a wall or an obstacle, in some physics step. The clearance is the
 smallest distance of trunk and legs (`hexapod.CAPSULES`) at the end of a frame, and zero after a touch.
@@ -32,7 +32,7 @@ from lgmdjax.transfer.cube_camera import CubeCamera
 from lgmdjax.transfer.faults import Faults, draw
 from lgmdjax.transfer.names import FaultName
 from lgmdjax.world import arena, mujoco_world
-from lgmdjax.world.mujoco_world import Style
+from lgmdjax.world.mujoco_world import PHOTOGRAPHIC, Style
 
 RAY_GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # what a scanner meets: all that can be touched, but the robot
 FAR = 10.0  # m; obstacles farther than this are not measured
@@ -42,9 +42,12 @@ FAR = 10.0  # m; obstacles farther than this are not measured
 class World:
     """What differs from the robot's own world, beside the engine."""
 
-    style: Style = Style()
+    style: Style = PHOTOGRAPHIC
     faults: tuple[FaultName, ...] = ()
     seed: int = 0  # of textures, shapes and faults
+
+
+UNCHANGED = World()
 
 
 class _Body(NamedTuple):
@@ -60,7 +63,12 @@ class _Body(NamedTuple):
 
 
 def walk(
-    robot: closed_loop.Params, rooms: Room, seconds: float, policy: PolicyName, world: World = World(), label: str = ""
+    robot: closed_loop.Params,
+    rooms: Room,
+    seconds: float,
+    policy: PolicyName,
+    world: World = UNCHANGED,
+    label: str = "",
 ) -> Record:
     """Walk a robot in each of some rooms, and return a record with axes (robot, frame).
 

@@ -18,6 +18,9 @@ from scipy.spatial import ConvexHull
 SIDES = 32  # of a cylinder: it is nowhere narrower than its circle by more than half a percent
 
 
+UP = np.array([0.0, 0.0, 1.0])
+
+
 class Mesh(NamedTuple):
     """A mesh with a normal and texture coordinates for each vertex."""
 
@@ -51,7 +54,7 @@ def sphere(radius: float, tile: float) -> Mesh:
     polar, angle = np.meshgrid(np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, columns), indexing="ij")
     normals = np.stack([np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)], axis=-1)
     texture = np.stack([angle, polar], axis=-1) * radius / tile
-    vertices = radius * (normals + [0, 0, 1])
+    vertices = radius * (normals + UP)
     index = np.arange(rows * columns).reshape(rows, columns)
     quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1).reshape(-1, 4)
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
@@ -67,7 +70,7 @@ def rock(
     """Return a convex rock within an upright ellipsoid: the hull of random points on it, with flat faces."""
     directions = rng.standard_normal((points, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    cloud = (directions + [0, 0, 1]) * [*half_size, top / 2]
+    cloud = (directions + UP) * [*half_size, top / 2]
     hull = ConvexHull(cloud)
     corners = cloud[hull.simplices]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -90,7 +93,7 @@ def _walls(ends: np.ndarray, normals: np.ndarray, heights: tuple[float, float], 
     s = np.broadcast_to(np.stack([along[:-1], along[1:]], axis=1)[:, None], (count, 2, 2))
     texture = np.stack([s, z], axis=-1) / tile
     first = 4 * np.arange(count)[:, None]
-    triangles = np.concatenate([first + [0, 1, 3], first + [0, 3, 2]])
+    triangles = np.concatenate([first + np.array([0, 1, 3]), first + np.array([0, 3, 2])])
     return Mesh(vertices.reshape(-1, 3), flat.reshape(-1, 3), texture.reshape(-1, 2), triangles)
 
 

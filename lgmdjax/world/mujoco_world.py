@@ -44,6 +44,7 @@ class Style:
     shapes: bool = True  # spheres, chairs and rocks among the prisms
 
 
+PHOTOGRAPHIC = Style()
 PLAIN = Style(photographs=False, shadows=False, shapes=False)
 
 
@@ -62,7 +63,7 @@ class Obstacle(NamedTuple):
     moves: bool
 
 
-def add_room(spec: mujoco.MjSpec, room: Arena, style: Style = Style(), seed: int = 0) -> None:
+def add_room(spec: mujoco.MjSpec, room: Arena, style: Style = PHOTOGRAPHIC, seed: int = 0) -> None:
     """Add a room to a model whose floor is the geom "floor"; `seed` chooses textures and shapes."""
     rng = np.random.default_rng(seed)
     room = _on_host(room)
