@@ -6,7 +6,7 @@ picture before every sixth set point, they are the same system.
 """
 
 from dataclasses import replace
-from functools import partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,8 @@ from lgmdjax.sensors import camera, camera_faults, hemifield, laser
 from lgmdjax.simulation import closed_loop
 from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS
 from lgmdjax.transfer.faults import Faults
+
+Tree = TypeVar("Tree")
 
 INTERVAL = 1 / (FRAME_RATE * SUBSTEPS)  # s, between two set points
 POLICY = policies.SWITCH
@@ -68,7 +70,7 @@ def see(
     ranges: Float[Array, " rays"],
 ) -> State:
     """Take a picture and a scan; if a picture arrives, detect, and decide about the velocity."""
-    cameras = camera_faults.State(**{**vars(state.cameras), "previous": _previous(state, pictures)})
+    cameras = replace(state.cameras, previous=_previous(state, pictures))
     cameras, delivery = camera_faults.step(faults.camera, cameras, pictures)
     field = {"overlap": params.camera.overlap, "ground": params.camera.ground}
     frames = [hemifield.crop(delivery.pictures[side], side, **field) for side in (hemifield.LEFT, hemifield.RIGHT)]
@@ -109,25 +111,25 @@ def restart(params: closed_loop.Params, faults: Faults, state: State, key: Array
     return _where(lifted, started, state)
 
 
-@partial(jax.jit)
+@jax.jit
 def init_batch(params: closed_loop.Params, faults: Faults, keys: Array) -> State:
     """Return the states of a batch of robots; `faults` and `keys` have an axis of robots, `params` has none."""
     return jax.vmap(init, in_axes=(None, 0, 0))(params, faults, keys)
 
 
-@partial(jax.jit)
+@jax.jit
 def see_batch(params: closed_loop.Params, faults: Faults, states: State, pictures: Array, ranges: Array) -> State:
     """Call `see` for a batch of robots."""
     return jax.vmap(see, in_axes=(None, 0, 0, 0, 0))(params, faults, states, pictures, ranges)
 
 
-@partial(jax.jit)
+@jax.jit
 def move_batch(params: closed_loop.Params, faults: Faults, states: State) -> tuple[State, Float[Array, "robots 6 3"]]:
     """Call `move` for a batch of robots."""
     return jax.vmap(move, in_axes=(None, 0, 0))(params, faults, states)
 
 
-@partial(jax.jit)
+@jax.jit
 def restart_batch(
     params: closed_loop.Params, faults: Faults, states: State, keys: Array, lifted: Bool[Array, " robots"]
 ) -> State:
@@ -135,5 +137,5 @@ def restart_batch(
     return jax.vmap(restart, in_axes=(None, 0, 0, 0, 0))(params, faults, states, keys, lifted)
 
 
-def _where(condition: Bool[Array, ""], chosen: object, otherwise: object) -> object:
+def _where(condition: Bool[Array, ""], chosen: Tree, otherwise: Tree) -> Tree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), chosen, otherwise)
