@@ -68,6 +68,7 @@ def walk(
     seconds: float,
     policy: PolicyName,
     world: World = UNCHANGED,
+    *,
     label: str = "",
 ) -> Record:
     """Walk a robot in each of some rooms, and return a record with axes (robot, frame).

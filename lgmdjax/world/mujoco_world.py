@@ -58,8 +58,7 @@ class Obstacle(NamedTuple):
     yaw: float
     bottom: float
     top: float
-    brightness: float
-    contrast: float
+    texture: np.ndarray  # as in `obstacles.TEXTURE_COLUMNS`
     moves: bool
 
 
@@ -71,7 +70,7 @@ def add_room(spec: mujoco.MjSpec, room: Arena, style: Style = PHOTOGRAPHIC, seed
     if style.photographs:
         for name in photographs.NAMES:
             _add_texture(spec, name)
-    _add_bounds(spec, room, style, rng)
+    _add_bounds(spec, room, rng)
     for obstacle in obstacles(room):
         _add_obstacle(spec, obstacle, style, rng)
 
@@ -86,7 +85,7 @@ def obstacles(room: Arena) -> Iterator[Obstacle]:
                 yield Obstacle(
                     index, is_box, np.asarray(prisms.centre[row], float), np.asarray(prisms.half_size[row], float),
                     float(prisms.yaw[row]), float(prisms.bottom[row]), float(prisms.top[row]),
-                    float(prisms.texture[row, 0]), float(prisms.texture[row, 1]), moves,
+                    np.asarray(prisms.texture[row], float), moves,
                 )  # fmt: skip
             index += 1
 
@@ -142,12 +141,13 @@ def _add_texture(spec: mujoco.MjSpec, name: photographs.TextureName) -> None:
 
 
 def _add_material(
-    spec: mujoco.MjSpec, name: str, brightness: float, contrast: float, repeat: float, rng: np.random.Generator
+    spec: mujoco.MjSpec, name: str, texture: np.ndarray, rng: np.random.Generator, *, repeat: float = 1.0
 ) -> None:
-    """Add a photograph as a material, or a plain grey where there is no `contrast` (or no photographs)."""
+    """Add a photograph as a material, or its grey where a room's `texture` has no contrast (or there are none)."""
+    brightness, contrast = float(texture[0]), float(texture[1])
     material = spec.add_material(name=name, specular=0.0, shininess=0.0)
     chosen = photographs.NAMES[rng.integers(len(photographs.NAMES))]
-    if contrast > 0 and any(texture.name == chosen for texture in spec.textures):
+    if contrast > 0 and any(each.name == chosen for each in spec.textures):
         names = [""] * int(mujoco.mjtTextureRole.mjNTEXROLE)
         names[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = chosen
         material.textures, material.texrepeat, material.texuniform = names, [repeat, repeat], repeat != 1
@@ -155,7 +155,7 @@ def _add_material(
         material.rgba = [brightness / 255] * 3 + [1.0]
 
 
-def _add_bounds(spec: mujoco.MjSpec, room: Arena, style: Style, rng: np.random.Generator) -> None:
+def _add_bounds(spec: mujoco.MjSpec, room: Arena, rng: np.random.Generator) -> None:
     """Add the walls, and give the floor its size and material; planes are seen from inside."""
     x_min, x_max, y_min, y_max = (float(bound) for bound in room.bounds)
     middle, half = (0.5 * (x_min + x_max), 0.5 * (y_min + y_max)), (0.5 * (x_max - x_min), 0.5 * (y_max - y_min))
@@ -163,17 +163,13 @@ def _add_bounds(spec: mujoco.MjSpec, room: Arena, style: Style, rng: np.random.G
     floor.pos, floor.size, floor.material, floor.group = [*middle, 0.0], [*half, 1.0], "floor", 0
     floor.contype, floor.conaffinity = WORLD, ROBOT
     floor.rgba = spec.default.geom.rgba  # any other colour would replace the material's
-    contrast = 1.0 if style.photographs else 0.0
-    tile = rng.uniform(*TILES)
-    _add_material(spec, "floor", float(room.floor_texture[0]), contrast * room.floor_texture[1], 1 / tile, rng)
+    _add_material(spec, "floor", room.floor_texture, rng, repeat=1 / rng.uniform(*TILES))
     walls = (
         ((x_min, middle[1]), half[1], 0.0), ((x_max, middle[1]), half[1], np.pi),
         ((middle[0], y_min), half[0], np.pi / 2), ((middle[0], y_max), half[0], -np.pi / 2),
     )  # fmt: skip
     for index, (position, length, yaw) in enumerate(walls):
-        brightness, wall_contrast = (float(value) for value in room.wall_texture[index, :2])
-        tile = rng.uniform(*TILES)
-        _add_material(spec, f"wall_{index}", brightness, contrast * wall_contrast, 1 / tile, rng)
+        _add_material(spec, f"wall_{index}", room.wall_texture[index], rng, repeat=1 / rng.uniform(*TILES))
         # The plane's own axes: x along the wall, y upward, z into the room.
         inward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         axes = np.column_stack([np.cross([0.0, 0.0, 1.0], inward), [0.0, 0.0, 1.0], inward])
@@ -188,7 +184,7 @@ def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, style: Style, rng: np
     name, tile = f"obstacle_{obstacle.index}", rng.uniform(*TILES)
     half = [np.cos(obstacle.yaw / 2), 0.0, 0.0, np.sin(obstacle.yaw / 2)]
     body = spec.worldbody.add_body(name=name, pos=[*obstacle.centre, 0.0], quat=half, mocap=obstacle.moves)
-    _add_material(spec, name, obstacle.brightness, obstacle.contrast if style.photographs else 0.0, 1.0, rng)
+    _add_material(spec, name, obstacle.texture, rng)
     may_vary = style.shapes and not obstacle.moves and obstacle.bottom <= 0
     if not may_vary or obstacle.half_size.min() < MIN_HALF_WIDTH:
         return _add_prism(spec, body, obstacle, tile)
@@ -201,12 +197,12 @@ def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, style: Style, rng: np
 def _add_prism(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, tile: float) -> None:
     (a, b), bottom, top = obstacle.half_size, obstacle.bottom, obstacle.top
     middle, half = 0.5 * (bottom + top), 0.5 * (top - bottom)
-    kind, size = (mujoco.mjtGeom.mjGEOM_CYLINDER, [a, half, 0.0])
     if obstacle.is_box:
-        kind, size = mujoco.mjtGeom.mjGEOM_BOX, [a, b, half]
+        kind, size, mesh = mujoco.mjtGeom.mjGEOM_BOX, [a, b, half], meshes.box(obstacle.half_size, bottom, top, tile)
+    else:
+        kind, size, mesh = mujoco.mjtGeom.mjGEOM_CYLINDER, [a, half, 0.0], meshes.cylinder(a, bottom, top, tile)
     body.add_geom(name=body.name, type=kind, size=size, pos=[0, 0, middle], group=1, contype=WORLD, conaffinity=ROBOT)
-    make = meshes.box(obstacle.half_size, bottom, top, tile) if obstacle.is_box else None
-    _add_mesh(spec, body, make or meshes.cylinder(a, bottom, top, tile))
+    _add_mesh(spec, body, mesh)
 
 
 def _add_sphere(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, tile: float) -> None:
@@ -232,7 +228,7 @@ def _add_chair(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, ti
     count = int(2 * a / SLAT_SPACING) + 1
     seat = [((x, -b, SEAT_HEIGHT), (x, b, SEAT_HEIGHT)) for x in np.linspace(-a, a, count)]
     rails = [((-a, -b, z), (-a, b, z)) for z in (back - 0.2, back)]
-    grey = [obstacle.brightness / 255] * 3 + [1.0]
+    grey = [obstacle.texture[0] / 255] * 3 + [1.0]
     for index, (start, end) in enumerate((*legs, *seat, *rails)):
         body.add_geom(
             name=body.name if index == 0 else f"{body.name}_{index}", type=mujoco.mjtGeom.mjGEOM_CAPSULE,
