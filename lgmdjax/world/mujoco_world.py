@@ -14,7 +14,7 @@ convex rock, within the outline of the prism that it stands for: starts that are
 and obstacles without contrast, as in the trials before a white wall, stay plain.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -187,14 +187,13 @@ def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, style: Style, rng: np
     _add_material(spec, name, obstacle.texture, rng)
     may_vary = style.shapes and not obstacle.moves and obstacle.bottom <= 0
     if not may_vary or obstacle.half_size.min() < MIN_HALF_WIDTH:
-        return _add_prism(spec, body, obstacle, tile)
-    shape = (_add_prism, _add_sphere, _add_chair, _add_rock)[rng.integers(4)]
-    if shape is _add_rock:
-        return _add_rock(spec, body, obstacle, tile, rng)
-    shape(spec, body, obstacle, tile)
+        return _add_prism(spec, body, obstacle, tile, rng)
+    SHAPES[rng.integers(len(SHAPES))](spec, body, obstacle, tile, rng)
 
 
-def _add_prism(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, tile: float) -> None:
+def _add_prism(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, tile: float, _: np.random.Generator
+) -> None:
     (a, b), bottom, top = obstacle.half_size, obstacle.bottom, obstacle.top
     middle, half = 0.5 * (bottom + top), 0.5 * (top - bottom)
     if obstacle.is_box:
@@ -205,7 +204,9 @@ def _add_prism(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, ti
     _add_mesh(spec, body, mesh)
 
 
-def _add_sphere(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, tile: float) -> None:
+def _add_sphere(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, tile: float, _: np.random.Generator
+) -> None:
     radius = min(float(obstacle.half_size.min()), 0.4)
     sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0, 0], "pos": [0, 0, radius]}
     body.add_geom(name=body.name, group=1, contype=WORLD, conaffinity=ROBOT, **sphere)
@@ -220,8 +221,10 @@ def _add_rock(
     geom.name, geom.group, geom.contype, geom.conaffinity = body.name, 0, WORLD, ROBOT
 
 
-def _add_chair(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, tile: float) -> None:
-    """Add four legs, a seat and a back of capsules; `tile` is not used, since its rods are plain."""
+def _add_chair(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, _: float, __: np.random.Generator
+) -> None:
+    """Add four legs, a seat and a back of capsules, which are plain."""
     a, b = np.minimum(obstacle.half_size, 0.25) - SLAT_RADIUS
     back = SEAT_HEIGHT + 0.4
     legs = [((x, y, SLAT_RADIUS), (x, y, SEAT_HEIGHT if x > 0 else back)) for x in (-a, a) for y in (-b, b)]
@@ -234,6 +237,14 @@ def _add_chair(spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, ti
             name=body.name if index == 0 else f"{body.name}_{index}", type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             fromto=[*start, *end], size=[SLAT_RADIUS, 0, 0], rgba=grey, group=0, contype=WORLD, conaffinity=ROBOT,
         )  # fmt: skip
+
+
+SHAPES: tuple[Callable[[mujoco.MjSpec, mujoco.MjsBody, Obstacle, float, np.random.Generator], None], ...] = (
+    _add_prism,
+    _add_sphere,
+    _add_chair,
+    _add_rock,
+)
 
 
 def _add_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, mesh: Mesh) -> mujoco.MjsGeom:
