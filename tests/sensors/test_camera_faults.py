@@ -73,7 +73,7 @@ def test_exposure_brings_every_picture_to_one_mean_and_drifts():
     for grey in (40.0, 200.0):
         steady, _ = run(Params(adapts=1.0), np.full((150, 2, HEIGHT, WIDTH), grey))
         assert steady[-1].mean() == pytest.approx(camera_faults.MEAN_GREY, rel=0.02)
-        assert abs(steady[1].mean() - grey) < 0.1 * grey  # slowly
+        assert 0 < abs(steady[1].mean() - grey) < 0.15 * grey  # slowly
     drifting, _ = run(Params(adapts=1.0, drift=0.2), np.full((300, 2, HEIGHT, WIDTH), 118.0))
     assert 5 < np.ptp(drifting[:, 0, 0, 0]) < 120
 
@@ -105,8 +105,8 @@ def test_a_share_of_the_pictures_is_lost():
 
 
 def test_warp_moves_an_edge_outward_or_inward():
-    """A step at column 30.5 of 40, seen by a lens that is off by 10 %: the picture shrinks towards its middle."""
-    picture = jnp.asarray(np.tile(np.where(np.arange(40) >= 31, 200.0, 0.0), (20, 1)))
+    """A ramp whose middle is at column 30.5 of 40, by a lens that is off by 10 %: the picture shrinks."""
+    picture = jnp.asarray(np.tile(200 * np.clip((np.arange(40) - 27) / 7, 0, 1), (20, 1)))
     warped = np.asarray(camera_faults.warp(picture, 0.1))[10]
     place = np.interp(100.0, warped, np.arange(40)) - 19.5
     u = np.linspace(0, 20, 20001)
