@@ -15,7 +15,6 @@ detectors look above the horizon.
 imported (`runtime.jax_setup.prepare_opengl`).
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -173,8 +172,3 @@ def _matrices(directions: np.ndarray, pixel: np.ndarray, pixels: int, face: int)
 
 def _to_pixel(place: np.ndarray, face: int) -> np.ndarray:
     return np.clip(np.floor(0.5 * (place + 1) * face).astype(int), 0, face - 1)
-
-
-def faces_drawn(weights: Sequence[dict[str, sparse.csr_matrix]]) -> int:
-    """Return how many faces are drawn for a stereo picture."""
-    return sum(map(len, weights))
