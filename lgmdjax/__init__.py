@@ -10,8 +10,8 @@
 | Record, Room, InputError | the types that they pass and the error that they raise |
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
-| simulation, deployment, reporting, evaluation, learning | what is done with them |
-| datasets, viewer, studies, pipeline, cli, runtime | walks for other libraries, in the browser; questions, stages, commands, files |
+| simulation, deployment, transfer, reporting, evaluation, learning | what is done with them |
+| datasets, viewer, studies, pipeline, cli, runtime | for other libraries, in the browser, and by commands |
 
 >>> import jax
 >>> import lgmdjax as lj

@@ -8,12 +8,15 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from lgmdjax.runtime.jax_setup import prepare_opengl
+
 # As variables, and before JAX is imported anywhere: processes that a test starts must find the same cache.
 ROOT = Path(__file__).parent.parent
 CACHE = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that robots are sharded
 os.environ.setdefault("MPLBACKEND", "Agg")
+prepare_opengl()
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs its own tuning flags as errors
 # Of small programs too, which every process would compile again.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -17,6 +17,7 @@ WINGS = (
     "learning",
     "evaluation",
     "reporting",
+    "transfer",
     "deployment",
     "simulation",
     "control",

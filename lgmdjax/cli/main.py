@@ -21,7 +21,7 @@ from lgmdjax import __version__
 from lgmdjax.cli import environment
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import interruption
-from lgmdjax.runtime.jax_setup import prepare_jax
+from lgmdjax.runtime.jax_setup import prepare_jax, prepare_opengl
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
 NOT_RESUMED = ("watch", "export", "export-dataset", "bench", "demo", "view", "doctor")
@@ -79,6 +79,8 @@ def study(arguments: Sequence[str]) -> None:
     from lgmdjax.cli import flags
 
     given = flags.parse_study(name, STUDIES[name], arguments[1:])
+    if name == "transfer":
+        prepare_opengl()
     environment.check_jax()
     from lgmdjax.cli.study import run_study
 
@@ -195,6 +197,7 @@ STUDIES: Mapping[str, str] = {
     "lgmd_gradient": "Does a detector that is fitted by gradient steer better than the calibrated one?",
     "gradient_horizon": "Over how many frames is a gradient through the closed loop meaningful?",
     "closed_loop_finetune": "Does the gradient through the closed loop teach what imitation cannot?",
+    "transfer": "Does the trained robot avoid obstacles in another engine, and which fault stops it?",
 }
 """The studies of `lgmdjax.studies`, and the question of each."""
 

@@ -24,6 +24,7 @@ from lgmdjax.studies import (
     overlap,
     sensitivity,
     supervision,
+    transfer,
     velocity,
 )
 
@@ -46,6 +47,7 @@ MODULES: Mapping[str, Study] = {
     "lgmd_gradient": lgmd_gradient,
     "gradient_horizon": gradient_horizon,
     "closed_loop_finetune": closed_loop_finetune,
+    "transfer": transfer,
 }
 
 

@@ -28,6 +28,7 @@ from lgmdjax.studies.settings import (
     OverlapSettings,
     SensitivitySettings,
     SupervisionSettings,
+    TransferSettings,
     VelocitySettings,
 )
 
@@ -44,6 +45,7 @@ StudySettings = (
     | LgmdGradientSettings
     | GradientHorizonSettings
     | FinetuneSettings
+    | TransferSettings
 )
 
 _SMALL = Resolution(width=64, height=48, pooling=2)
@@ -175,5 +177,6 @@ STUDY_PRESETS: Mapping[str, StudySettings] = {
         clip=10.0,
         seeds=3,
     ),
+    "transfer": TransferSettings(),
 }
 """Settings of the studies that are no stages of a run."""

@@ -1,5 +1,6 @@
 from . import antialiasing as antialiasing
 from . import camera as camera
+from . import camera_faults as camera_faults
 from . import compositing as compositing
 from . import fusion as fusion
 from . import hemifield as hemifield

@@ -12,6 +12,7 @@
 | lgmd_gradient        | eqs. 9-16        | Is a detector fitted by gradient better than the calibrated one?           |
 | gradient_horizon     | -                | Through how many frames is a gradient of the closed loop useful?           |
 | closed_loop_finetune | -                | Does finetuning in the closed loop reduce collisions more than DAgger?     |
+| transfer             | -                | Does the trained robot avoid obstacles in another engine?                  |
 
 Each module has two functions. `run(folder, inputs, settings, seed)` writes <study>.json, a list of rows; it also keeps
 the walks that it recorded, so that an interrupted study resumes. `plot(rows)` makes a figure of the rows. The first

@@ -8,4 +8,5 @@ from . import overlap as overlap
 from . import sensitivity as sensitivity
 from . import settings as settings
 from . import supervision as supervision
+from . import transfer as transfer
 from . import velocity as velocity

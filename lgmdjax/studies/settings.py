@@ -1,10 +1,14 @@
 """Settings of the studies. Imports no JAX, so that the command line can."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
+from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.learning.settings import DaggerSettings
 from lgmdjax.sensors.settings import Resolution
 from lgmdjax.simulation.settings import BenchmarkRooms
+from lgmdjax.transfer.names import FAULT_NAMES, FaultName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,3 +98,37 @@ class FinetuneSettings:
     learning_rate: float  # per second of window, in units of the parameters' size
     clip: float  # largest norm of one robot's gradient, as a multiple of the robots' median
     seeds: int  # number of random seeds
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransferSize:
+    """Number and duration of the walks of each row of study transfer."""
+
+    robots: int  # in as many random rooms
+    seconds: float  # in each room
+    seeds: int  # of each scene
+    scene_seconds: float
+
+
+TRANSFER_SIZES: Mapping[str, TransferSize] = {
+    "smoke": TransferSize(robots=2, seconds=2.0, seeds=2, scene_seconds=2.0),
+    "quick": TransferSize(robots=4, seconds=30.0, seeds=4, scene_seconds=60.0),
+    "full": TransferSize(robots=64, seconds=180.0, seeds=12, scene_seconds=90.0),
+}
+"""A frame of a robot takes 20 ms of one core: a row of random rooms a minute at quick, two hours at full."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransferSettings:
+    """The trained robot in another engine, with faults of cameras, servos and body."""
+
+    scale: Literal["smoke", "quick", "full"] = "quick"
+    """how many robots walk for how long: minutes a row, or hours"""
+    scenes: tuple[TrialName, ...] = ("indoor", "outdoor")
+    """scenes in which learned, teacher and blind walk, beside the random rooms"""
+    faults: tuple[FaultName, ...] = FAULT_NAMES
+    """faults, one at a time and together"""
+
+    def size(self) -> TransferSize:
+        """Return number and duration of the walks."""
+        return TRANSFER_SIZES[self.scale]

@@ -1,0 +1,49 @@
+"""The robot in a room, for C MuJoCo: its true geoms collide, with MuJoCo's default contacts, and it has cube cameras.
+
+In `mjcf/hexapod.xml` feet collide with the floor, and a few enlarged shapes with barriers, as MJX needs it. Here
+barriers and explicit pairs are left out, and every geom of the robot that is drawn collides with floor, walls and
+obstacles: hard contacts, with the friction of the geoms.
+"""
+
+import mujoco
+import numpy as np
+
+from lgmdjax.body import hexapod
+from lgmdjax.transfer import cube_camera
+from lgmdjax.world import mujoco_world
+from lgmdjax.world.arena import Arena
+from lgmdjax.world.mujoco_world import PHOTOGRAPHIC, ROBOT, WORLD, Style
+
+DRAWN = 2  # group of the robot's geoms in the XML
+
+
+def build(room: Arena, style: Style = PHOTOGRAPHIC, *, seed: int = 0, face: int = cube_camera.FACE) -> mujoco.MjModel:
+    """Return the robot's model with a single room around it.
+
+    Args:
+        room: the room, not a batch.
+        style: how it looks.
+        seed: of textures and shapes.
+        face: width of a face of the cube cameras [px].
+    """
+    spec = mujoco.MjSpec.from_file(str(hexapod.xml_path()))
+    for pair in list(spec.pairs):
+        spec.delete(pair)
+    for geom in [geom for geom in spec.geoms if geom.name.startswith("before_")]:
+        spec.delete(geom)
+    for geom in spec.geoms:
+        if geom.group == DRAWN:
+            geom.contype, geom.conaffinity = ROBOT, WORLD
+    cube_camera.add_cameras(spec, face)
+    mujoco_world.add_room(spec, room, style, seed)
+    return spec.compile()
+
+
+def reset(model: mujoco.MjModel, data: mujoco.MjData, start: np.ndarray) -> None:
+    """Put the robot at rest at a start pose x, y, yaw [m, m, rad], in its default stance."""
+    x, y, yaw = (float(value) for value in start)
+    stance = model.key("stance").qpos
+    data.qpos[:] = stance
+    data.qpos[:2], data.qpos[3:7] = (x, y), (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+    data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = 0.0, 0.0, stance[7:]
+    mujoco.mj_forward(model, data)
