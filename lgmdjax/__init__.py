@@ -10,7 +10,8 @@
 | Record, Room, InputError | the types that they pass and the error that they raise |
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
-| simulation, deployment, reporting, evaluation, learning, studies, pipeline, cli, runtime | what is done with them |
+| simulation, deployment, reporting, evaluation, environments | what is done with them |
+| learning, studies, pipeline, cli, runtime | and what comes of that |
 
 >>> import jax
 >>> import lgmdjax as lj

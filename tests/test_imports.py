@@ -13,6 +13,7 @@ WINGS = (
     "pipeline",
     "studies",
     "learning",
+    "environments",
     "evaluation",
     "reporting",
     "deployment",
