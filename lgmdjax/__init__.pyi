@@ -6,6 +6,7 @@ from . import control as control
 from . import datasets as datasets
 from . import deployment as deployment
 from . import detectors as detectors
+from . import environments as environments
 from . import evaluation as evaluation
 from . import learning as learning
 from . import locomotion as locomotion

@@ -15,6 +15,7 @@ WINGS = (
     "studies",
     "datasets",
     "learning",
+    "environments",
     "evaluation",
     "reporting",
     "transfer",

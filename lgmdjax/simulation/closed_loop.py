@@ -206,7 +206,7 @@ def step(
     moved, clearance = move(mover[0], model, scene, mover[1])
     moved = replace(moved, controller=replace(state.controller, cpg=moved.controller.cpg))
     record = _record(state, observation, label, clearance)
-    return _freeze_unhealthy(state, moved), record
+    return freeze_unhealthy(state, moved), record
 
 
 def _hold_vision(state: State, observation: Observation) -> tuple[State, Observation]:
@@ -237,11 +237,23 @@ def observe(
     params: Params, scene: arena.Arena, state: State, render: Bool[Array, ""] | bool = True
 ) -> tuple[State, Observation]:
     """Render, scan, and step the LGMDs (eqs. 7-16); return the observation from the robot's present pose."""
+    return respond(params, state, *sense(params, scene, state, render))
+
+
+def sense(
+    params: Params, scene: arena.Arena, state: State, render: Bool[Array, ""] | bool = True
+) -> tuple[Float[Array, "2 height columns"], Float[Array, " rays"]]:
+    """Return both pictures [grey, 0..255] and the laser's ranges [m] from the robot's present pose."""
     pose = hexapod.pose(state.data)
     ranges = laser.scan(params.laser, scene, *hexapod.laser_pose(pose))
-
     head = pose if params.head_sway is None else hexapod.scale_tilt(pose, params.head_sway)
-    frames = render_stereo(params.camera, scene, head, render)
+    return render_stereo(params.camera, scene, head, render), ranges
+
+
+def respond(
+    params: Params, state: State, frames: Float[Array, "2 height columns"], ranges: Float[Array, " rays"]
+) -> tuple[State, Observation]:
+    """Step the LGMDs (eqs. 7-16) by what `sense` returned; return the observation."""
     detected = controller.detect_or_start(params.controller, state.controller, frames, state.is_first)
     controller_state, response = detected
     if params.frame_stride is not None:
@@ -283,8 +295,13 @@ def decide(params: Params, state: State, observation: Observation, policy: Polic
     return replace(state, controller=controller_state, teacher=teacher), label
 
 
-def move(params: Params, model: mjx.Model, scene: arena.Arena, state: State) -> tuple[State, Float[Array, ""]]:
-    """Run CPG, servos and physics until the next frame; return also the smallest clearance [m] within it."""
+def move(
+    params: Params, model: mjx.Model, scene: arena.Arena, state: State, targets: Float[Array, "6 3"] | None = None
+) -> tuple[State, Float[Array, ""]]:
+    """Run CPG, servos and physics until the next frame; return also the smallest clearance [m] within it.
+
+    With `targets` [rad] the servos hold these set points for the whole frame, and the CPG stands still.
+    """
     model = hexapod.place_barriers(model, scene, state.data)
     interval = 1 / (FRAME_RATE * SUBSTEPS)
 
@@ -293,8 +310,10 @@ def move(params: Params, model: mjx.Model, scene: arena.Arena, state: State) -> 
         carry: tuple[mjx.Data, controller.State], _: None
     ) -> tuple[tuple[mjx.Data, controller.State], Float[Array, ""]]:
         data, controller_state = carry
-        controller_state, targets = controller.move(params.controller, controller_state, interval)
-        data = hexapod.substep(model, data, targets)
+        set_points = targets
+        if set_points is None:
+            controller_state, set_points = controller.move(params.controller, controller_state, interval)
+        data = hexapod.substep(model, data, set_points)
         clearance = jnp.min(arena.clearance(scene, *hexapod.capsules(model, data)))
         return (data, controller_state), clearance
 
@@ -333,7 +352,7 @@ def _record(state: State, observation: Observation, label: Float[Array, "2"], cl
     )
 
 
-def _freeze_unhealthy(before: State, after: State) -> State:
+def freeze_unhealthy(before: State, after: State) -> State:
     """Freeze a robot for good, in its last healthy state, if it fell or became non-finite; the frame count goes on."""
     ok = before.ok & hexapod.is_healthy(after.data)
     return replace(_where(ok, after, before), ok=ok, frame=after.frame)

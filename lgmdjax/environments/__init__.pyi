@@ -1,0 +1,5 @@
+from . import coverage as coverage
+from . import functional as functional
+from . import gym_env as gym_env
+from . import rendering as rendering
+from . import rewards as rewards
