@@ -11,7 +11,7 @@
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
 | simulation, deployment, transfer, reporting, evaluation, learning | what is done with them |
-| datasets, environments, viewer, studies, pipeline, cli, runtime | for other libraries, in the browser, and by commands |
+| datasets, environments, viewer, studies, pipeline, cli, runtime | for other libraries, in the browser, by commands |
 
 >>> import jax
 >>> import lgmdjax as lj
