@@ -11,6 +11,7 @@
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
 | simulation, deployment, reporting, evaluation, learning, studies, pipeline, cli, runtime | what is done with them |
+| hardware | cameras and servos, for a robot outside of the simulator |
 
 >>> import jax
 >>> import lgmdjax as lj

@@ -6,6 +6,7 @@ from . import control as control
 from . import deployment as deployment
 from . import detectors as detectors
 from . import evaluation as evaluation
+from . import hardware as hardware
 from . import learning as learning
 from . import locomotion as locomotion
 from . import pipeline as pipeline

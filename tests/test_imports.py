@@ -14,6 +14,7 @@ WINGS = (
     "studies",
     "learning",
     "evaluation",
+    "hardware",
     "reporting",
     "deployment",
     "simulation",
