@@ -24,7 +24,7 @@ from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import prepare_jax
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
-NOT_RESUMED = ("watch", "export", "bench", "doctor")
+NOT_RESUMED = ("watch", "export", "drive", "calibrate-camera", "servos", "sim-robot", "bench", "doctor")
 MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
@@ -108,6 +108,52 @@ def export(arguments: Sequence[str]) -> None:
         print(line)
 
 
+def drive(arguments: Sequence[str]) -> int:
+    """Let a robot walk: its nervous system between a live camera and servos (extra `drive`)."""
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_drive(_summary(drive), arguments)
+    environment.start_jax()
+    from lgmdjax.cli.drive import drive as run
+
+    return run(given)
+
+
+def calibrate_camera(arguments: Sequence[str]) -> None:
+    """Calibrate a camera's lens from pictures of a chessboard (extra `drive`)."""
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_calibrate_camera(_summary(calibrate_camera), arguments)
+    environment.start_jax()
+    from lgmdjax.cli.calibrate_camera import calibrate
+
+    for line in calibrate(given):
+        print(line)
+
+
+def servos(arguments: Sequence[str]) -> None:
+    """Find out which servo is which joint: `servos map` moves one at a time (extra `drive`)."""
+    _choose("lgmdjax servos", "ACTION", _summary(servos), {"map": "move one servo at a time and ask"}, arguments[:1])
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_servos_map(_summary(servos), arguments[1:])
+    environment.start_jax()
+    from lgmdjax.cli.servos import map_servos
+
+    map_servos(given)
+
+
+def sim_robot(arguments: Sequence[str]) -> None:
+    """Play a robot in a room: servos on a pseudo-terminal, eyes as a stream of pictures."""
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_sim_robot(_summary(sim_robot), arguments)
+    environment.start_jax()
+    from lgmdjax.cli.sim_robot import run_robot
+
+    run_robot(given)
+
+
 def bench(arguments: Sequence[str]) -> None:
     """Compare looming detectors on laboratory stimuli: table, JSON, figure."""
     from lgmdjax.cli import flags
@@ -141,6 +187,10 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "study": study,
     "watch": watch,
     "export": export,
+    "drive": drive,
+    "calibrate-camera": calibrate_camera,
+    "servos": servos,
+    "sim-robot": sim_robot,
     "bench": bench,
     "doctor": doctor,
 }

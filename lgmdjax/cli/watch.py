@@ -35,6 +35,7 @@ from lgmdjax import __version__
 from lgmdjax.cli.flags import WatchFlags
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
+from lgmdjax.hardware import live_source
 from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage
@@ -70,9 +71,18 @@ def watch_video(flags: WatchFlags) -> list[Path]:
     given = {name: getattr(flags, name) for name in CONSTANTS}
     params = replace(lgmd.Params(), **{name: value for name, value in given.items() if value is not None})
     layout = StereoLayout(stereo=flags.stereo is not None, overlap=flags.overlap, width=flags.width)
-    return detect_looming(
-        flags.video, flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
-    )
+    if live_source.is_live(flags.video):
+        if not flags.seconds > 0:
+            raise InputError(f"expected --seconds above 0, got {flags.seconds:g}; a live source is watched for so long")
+        name, reader = live_source.file_name(flags.video), live_source.open_reader(flags.video, flags.seconds)
+    else:
+        name = os.path.expanduser(flags.video)
+        reader = video_io.open_reader(Path(name))
+    lgmd.check(params)
+    with reader as video:
+        return detect_in(
+            video, Path(name), flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
+        )
 
 
 def detect_looming(
@@ -89,23 +99,38 @@ def detect_looming(
     Raises InputError, and writes nothing, if the video is missing, damaged, too short, or does not fit the layout.
     """
     lgmd.check(params)
-    folder = out / path.name
     with video_io.open_reader(path) as video:
-        width, height = _scaled_size(path, video, layout)
-        eyes = _split(np.zeros((height, width), np.uint8), layout)
-        overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
-        _print_notes(path, video)
-        with storage.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
-            samples, excitations = _process(
-                frames, layout, params, overlay=overlay_layout, target=partial_folder / "overlay.mp4", rate=video.rate
+        return detect_in(video, path, out, layout=layout, params=params, table=table, overlay=overlay)
+
+
+def detect_in(
+    video: video_io.Video,
+    path: Path,
+    out: Path,
+    *,
+    layout: StereoLayout,
+    params: lgmd.Params,
+    table: TableFormat = "csv",
+    overlay: bool = True,
+) -> list[Path]:
+    """Run both detectors on an open video; arguments, files and errors as of `detect_looming`."""
+    lgmd.check(params)
+    folder = out / path.name
+    width, height = _scaled_size(path, video, layout)
+    eyes = _split(np.zeros((height, width), np.uint8), layout)
+    overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
+    _print_notes(path, video)
+    with storage.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
+        samples, excitations = _process(
+            frames, layout, params, overlay=overlay_layout, target=partial_folder / "overlay.mp4", rate=video.rate
+        )
+        if len(samples) < MIN_FRAMES:
+            raise InputError(
+                f"expected a video of {MIN_FRAMES} frames or more, got {len(samples)} in {path}; take a longer one"
             )
-            if len(samples) < MIN_FRAMES:
-                raise InputError(
-                    f"expected a video of {MIN_FRAMES} frames or more, got {len(samples)} in {path}; take a longer one"
-                )
-            responses = _table(samples, excitations, _metadata(path, video, layout, params))
-            _write_table(responses, partial_folder, table)
-            (partial_folder / "response.png").write_bytes(style.to_png(plot(responses, params)))
+        responses = _table(samples, excitations, _metadata(path, video, layout, params))
+        _write_table(responses, partial_folder, table)
+        (partial_folder / "response.png").write_bytes(style.to_png(plot(responses, params)))
     written = [f"response.{table}", "response.png", *(["overlay.mp4"] if overlay else [])]
     for earlier in {"response.csv", "response.parquet", "overlay.mp4"} - set(written):
         (folder / earlier).unlink(missing_ok=True)
