@@ -18,7 +18,7 @@ from lgmdjax.reporting import video_geometry, video_io
 from lgmdjax.sensors import camera
 
 FIRST_TIMEOUT = 20.0  # s for the first picture
-SILENCE = 5.0  # s without a picture after which a live source is opened again
+SILENCE = 10.0  # s without a picture after which a live source is opened again
 CLOSING = 0.5  # s of the wall
 RETRY_INTERVAL = 0.5  # s of the wall between two attempts
 PAIR_TOLERANCE = 0.5  # of a period, between the pictures of two cameras

@@ -33,7 +33,7 @@ from lgmdjax.reporting import video_geometry, video_io, video_source
 PROTOCOLS = ("tcp", "udp", "rtp", "rtsp", "rtsps", "http", "https", "srt", "rtmp")
 WHITELIST = ",".join((*PROTOCOLS, "tls", "crypto", "httpproxy"))
 FORMATS = ",".join((*video_source.VIDEO_FORMATS, "rtsp", "rtp", "sdp", "mpjpeg", "live_flv"))
-OPEN_TIMEOUT, READ_TIMEOUT = 10.0, 5.0  # s
+PATIENCE = 10.0  # s, for a source that opens, and for each of its pictures
 PROMPT = {"fflags": "nobuffer", "flags": "low_delay", "probesize": "5000000", "analyzeduration": "500000"}
 
 
@@ -75,19 +75,19 @@ def file_name(source: str) -> str:
 
 
 @contextlib.contextmanager
-def open_live(source: str, *, rate: int | None = None, patience: float = READ_TIMEOUT) -> Iterator[InputContainer]:
+def open_live(source: str, *, rate: int | None = None, patience: float = PATIENCE) -> Iterator[InputContainer]:
     """Open a live source for FFmpeg.
 
     Args:
         source: device, address or pipe.
         rate: that a device is asked for [frames/s]; its own if None.
-        patience: how long to wait for a picture [s of the wall].
+        patience: how long to wait for it to open, and for each picture [s of the wall].
 
     Raises InputError if there is none, or none with pictures.
     """
     with contextlib.ExitStack() as stack:
         try:
-            container = _open(source, rate, (OPEN_TIMEOUT, patience), stack)
+            container = _open(source, rate, patience, stack)
         except (FFmpegError, OSError, ValueError) as error:
             name, reason = without_login(source), video_source.reason(error)
             raise InputError(
@@ -97,13 +97,13 @@ def open_live(source: str, *, rate: int | None = None, patience: float = READ_TI
         yield stack.enter_context(container)
 
 
-def _open(source: str, rate: int | None, timeout: tuple[float, float], stack: contextlib.ExitStack) -> InputContainer:
+def _open(source: str, rate: int | None, patience: float, stack: contextlib.ExitStack) -> InputContainer:
     if is_stream(source):
         options = PROMPT | {"protocol_whitelist": WHITELIST, "format_whitelist": FORMATS, "rtsp_transport": "tcp"}
-        return av.open(source, "r", options=options, timeout=timeout)
+        return av.open(source, "r", options=options, timeout=patience)
     if is_device(source):
         wanted = {} if rate is None else {"framerate": str(rate)}
-        return av.open(source, "r", format="v4l2", options=wanted, timeout=timeout)
+        return av.open(source, "r", format="v4l2", options=wanted, timeout=patience)
     file = stack.enter_context(io.FileIO(source))
     options = PROMPT | {"protocol_whitelist": "none", "format_whitelist": FORMATS}
     return av.open(video_source.Pipe(file), "r", options=options, buffer_size=1 << 12)

@@ -139,7 +139,10 @@ class Renderer:
 
     def compile(self, pose: hexapod.Pose) -> None:
         """Render once and forget the picture."""
-        np.asarray(self._render(pose))
+        self.start(pose)
+        if self._pending is not None:
+            self._pending.result()
+        self._pending = None
 
     def start(self, pose: hexapod.Pose) -> None:
         """Begin with a picture from a pose of the trunk, unless the one before is not done."""
