@@ -127,16 +127,15 @@ def _fit(
     corners: Sequence[Float[np.ndarray, "corners 2"]], board: Board, model: Model, size: tuple[int, int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the error [px], K and D that OpenCV fits to the corners."""
-    points = [board.points()[:, None].astype(np.float32)] * len(corners)
-    seen = [each[:, None].astype(np.float32) for each in corners]
+    points = [board.points()[None].astype(np.float32)] * len(corners)  # OpenCV 5 wants rows of points
+    seen = [each[None].astype(np.float32) for each in corners]
     try:
         if model == "fisheye":
             names = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # before OpenCV 5, and since
-            flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW | names.CALIB_USE_INTRINSIC_GUESS
-            start = np.array([[size[0] / np.pi, 0, size[0] / 2], [0, size[0] / np.pi, size[1] / 2], [0, 0, 1]])
+            flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
             points = [each.astype(np.float64) for each in points]
             seen = [each.astype(np.float64) for each in seen]
-            error, K, D, _, _ = cv2.fisheye.calibrate(points, seen, size, start, np.zeros((4, 1)), flags=flags)
+            error, K, D, _, _ = cv2.fisheye.calibrate(points, seen, size, np.eye(3), np.zeros((4, 1)), flags=flags)
         else:
             error, K, D, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
     except cv2.error as fault:
