@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ def start(command: str, *flags: str | Path, out: Path) -> subprocess.Popen[str]:
             stderr=subprocess.STDOUT,
             text=True,
             env=ENVIRONMENT,
+            preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
         )
 
 
