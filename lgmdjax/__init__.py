@@ -10,7 +10,7 @@
 | Record, Room, InputError | the types that they pass and the error that they raise |
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
-| simulation, deployment, transfer, reporting, evaluation, learning | what is done with them |
+| simulation, deployment, transfer, hardware, reporting, evaluation, learning | what is done with them |
 | datasets, environments, viewer, studies, pipeline, cli, runtime | for other libraries, in the browser, by commands |
 
 >>> import jax

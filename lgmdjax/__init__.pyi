@@ -8,6 +8,7 @@ from . import deployment as deployment
 from . import detectors as detectors
 from . import environments as environments
 from . import evaluation as evaluation
+from . import hardware as hardware
 from . import learning as learning
 from . import locomotion as locomotion
 from . import pipeline as pipeline

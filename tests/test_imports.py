@@ -17,6 +17,7 @@ WINGS = (
     "learning",
     "environments",
     "evaluation",
+    "hardware",
     "reporting",
     "transfer",
     "deployment",

@@ -114,8 +114,10 @@ class AlarmFlags:
 class WatchFlags:
     """The video, and how the detectors see it."""
 
-    video: tyro.conf.Positional[Path]
-    """any video that FFmpeg reads; /dev/stdin for a pipe"""
+    video: tyro.conf.Positional[str]
+    """any video that FFmpeg reads, or a live source: /dev/video0, tcp://, rtsp:// or http://..., a pipe, /dev/stdin"""
+    seconds: float = 60.0
+    """how long a live source is watched, if it does not end before; a file is watched to its end"""
     stereo: Literal["side-by-side"] | None = None
     """each frame holds the pictures of the left and the right eye, side by side"""
     mono: tyro.conf.FlagCreatePairsOff[bool] = False

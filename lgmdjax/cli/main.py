@@ -24,7 +24,10 @@ from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import prepare_jax, prepare_opengl
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
-NOT_RESUMED = ("watch", "export", "export-dataset", "bench", "demo", "view", "doctor")
+NOT_RESUMED = (
+    "watch", "export", "export-dataset", "drive", "calibrate-camera", "servos", "sim-robot", "bench", "demo", "view",
+    "doctor",
+)  # fmt: skip
 ALARM_CODE = 3  # exit code of `lgmdjax watch --alarm.exit-code` after an alarm
 MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
@@ -125,6 +128,52 @@ def export_dataset(arguments: Sequence[str]) -> None:
         print(file)
 
 
+def drive(arguments: Sequence[str]) -> int:
+    """Let a robot walk: its nervous system between a live camera and servos (extra `drive`)."""
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_drive(_summary(drive), arguments)
+    environment.check_jax()
+    from lgmdjax.cli.drive import drive as run
+
+    return run(given)
+
+
+def calibrate_camera(arguments: Sequence[str]) -> None:
+    """Calibrate a camera's lens from pictures of a chessboard (extra `drive`)."""
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_calibrate_camera(_summary(calibrate_camera), arguments)
+    environment.check_jax()
+    from lgmdjax.cli.calibrate_camera import calibrate
+
+    for line in calibrate(given):
+        print(line)
+
+
+def servos(arguments: Sequence[str]) -> None:
+    """Find out which servo is which joint: `servos map` moves one at a time (extra `drive`)."""
+    _choose("lgmdjax servos", "ACTION", _summary(servos), {"map": "move one servo at a time and ask"}, arguments[:1])
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_servos_map(_summary(servos), arguments[1:])
+    environment.check_jax()
+    from lgmdjax.cli.servos import map_servos
+
+    map_servos(given)
+
+
+def sim_robot(arguments: Sequence[str]) -> None:
+    """Play a robot in a room: servos on a pseudo-terminal, eyes as a stream of pictures."""
+    from lgmdjax.cli import hardware_flags
+
+    given = hardware_flags.parse_sim_robot(_summary(sim_robot), arguments)
+    environment.check_jax()
+    from lgmdjax.cli.sim_robot import run_robot
+
+    run_robot(given)
+
+
 def bench(arguments: Sequence[str]) -> None:
     """Compare looming detectors on laboratory stimuli or labelled videos: table, JSON, figure, page."""
     from lgmdjax.cli import flags
@@ -180,6 +229,10 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "watch": watch,
     "export": export,
     "export-dataset": export_dataset,
+    "drive": drive,
+    "calibrate-camera": calibrate_camera,
+    "servos": servos,
+    "sim-robot": sim_robot,
     "bench": bench,
     "demo": demo,
     "view": view,

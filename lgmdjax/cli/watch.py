@@ -32,6 +32,7 @@ from lgmdjax.cli.flags import WatchFlags
 from lgmdjax.cli.watch_files import Detectors, Responses, TableFormat
 from lgmdjax.detectors import alarm, lgmd
 from lgmdjax.errors import InputError
+from lgmdjax.hardware import live_source
 from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
 from lgmdjax.runtime import partial_files
 from lgmdjax.runtime.storage import JsonObject
@@ -64,6 +65,22 @@ def watch_video(flags: WatchFlags) -> Watched:
     """Run both detectors on the video of the flags."""
     if flags.mono and flags.stereo is not None:
         raise InputError("expected --mono or --stereo, got both; leave one out")
+    if live_source.is_live(flags.video):
+        if not flags.seconds > 0:
+            raise InputError(f"expected --seconds above 0, got {flags.seconds:g}; a live source is watched for so long")
+        name, reader = live_source.file_name(flags.video), live_source.open_reader(flags.video, flags.seconds)
+    else:
+        name = os.path.expanduser(flags.video)
+        reader = video_io.open_reader(Path(name))
+    layout, params = _settings(flags)
+    with reader as video:
+        return detect_in(
+            video, Path(name), flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
+        )
+
+
+def _settings(flags: WatchFlags) -> tuple[StereoLayout, Detectors]:
+    """Return what the flags say of the picture, the detectors and the alarm; raise InputError if they cannot be."""
     given = {name: getattr(flags, name) for name in lgmd.SCALARS}
     check_field(overlap=flags.overlap, ground=flags.ground, falloff=flags.falloff)
     if not 0 < flags.fov <= 360:
@@ -80,14 +97,9 @@ def watch_video(flags: WatchFlags) -> Watched:
         stereo=flags.stereo is not None, overlap=flags.overlap, ground=flags.ground, width=flags.width
     )
     raised = alarm.Params(threshold=flags.alarm.threshold, persistence=flags.alarm.persistence)
-    return detect_looming(
-        flags.video,
-        flags.out,
-        layout=layout,
-        params=Detectors(params, raised),
-        table=flags.table,
-        overlay=flags.overlay,
-    )
+    lgmd.check(params)
+    alarm.check(raised)
+    return layout, Detectors(params, raised)
 
 
 def detect_looming(
@@ -103,30 +115,43 @@ def detect_looming(
 
     Raises InputError, and writes nothing, if the video is missing, damaged, too short, or does not fit the layout.
     """
+    with video_io.open_reader(path) as video:
+        return detect_in(video, path, out, layout=layout, params=params, table=table, overlay=overlay)
+
+
+def detect_in(
+    video: video_io.Video,
+    path: Path,
+    out: Path,
+    *,
+    layout: StereoLayout,
+    params: Detectors,
+    table: TableFormat = "csv",
+    overlay: bool = True,
+) -> Watched:
+    """Run both detectors on an open video; arguments, files and errors as of `detect_looming`."""
     lgmd.check(params.lgmd)
     alarm.check(params.alarm)
     folder = out / path.name
-    with video_io.open_reader(path) as video:
-        width, height = _scaled_size(path, video, layout)
-        eyes = _split(np.zeros((height, width), np.uint8), layout)
-        overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
-        _print_notes(path, video)
-        params = params._replace(alarm=replace(params.alarm, frame_time=1 / float(video.rate)))
-        with partial_files.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
-            with contextlib.ExitStack() as stack:
-                write = None
-                if overlay_layout is not None:
-                    target, size = partial_folder / "overlay.mp4", overlay_layout.size
-                    write = stack.enter_context(video_io.open_writer(target, *size, video.rate, fast=True))
-                seen = _process(frames, layout, params, overlay_layout, write)
-            if len(seen.samples) < MIN_FRAMES:
-                raise InputError(
-                    f"expected a video of {MIN_FRAMES} frames or more, got {len(seen.samples)} in {path}; "
-                    "take a longer one"
-                )
-            name = os.fsencode(path.name).decode("utf-8", "replace")
-            facts = {"video": name, "eyes": asdict(layout), "rate": float(video.rate)}
-            alarms = watch_files.write_files(partial_folder, seen, params, facts, table)
+    width, height = _scaled_size(path, video, layout)
+    eyes = _split(np.zeros((height, width), np.uint8), layout)
+    overlay_layout = lgmd_overlay.make_layout(*eyes.shape[1:]) if overlay else None
+    _print_notes(path, video)
+    params = params._replace(alarm=replace(params.alarm, frame_time=1 / float(video.rate)))
+    with partial_files.replacing_all(folder) as partial_folder, _progress(video, width, height) as frames:
+        with contextlib.ExitStack() as stack:
+            write = None
+            if overlay_layout is not None:
+                target, size = partial_folder / "overlay.mp4", overlay_layout.size
+                write = stack.enter_context(video_io.open_writer(target, *size, video.rate, fast=True))
+            seen = _process(frames, layout, params, overlay_layout, write)
+        if len(seen.samples) < MIN_FRAMES:
+            raise InputError(
+                f"expected a video of {MIN_FRAMES} frames or more, got {len(seen.samples)} in {path}; take a longer one"
+            )
+        name = os.fsencode(path.name).decode("utf-8", "replace")
+        facts = {"video": name, "eyes": asdict(layout), "rate": float(video.rate)}
+        alarms = watch_files.write_files(partial_folder, seen, params, facts, table)
     written = [f"response.{table}", "response.png", "alarms.json", *(["overlay.mp4"] if overlay else [])]
     for earlier in {"response.csv", "response.parquet", "overlay.mp4"} - set(written):
         (folder / earlier).unlink(missing_ok=True)

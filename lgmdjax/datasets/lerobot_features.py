@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from lgmdjax.body import hexapod
 from lgmdjax.datasets.pictures import Eyes
 from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.sensors import hemifield
 from lgmdjax.simulation.closed_loop import FRAME_RATE
-from lgmdjax.simulation.episode_tables import FIELDS, SIDES
+from lgmdjax.simulation.episode_tables import FIELDS
 
 VERSION = "v3.0"
 TASK = "Walk on through the room and touch nothing."
@@ -26,7 +27,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "contact": ("contact",),
 }
 """The fields of `Record` in each feature. LeRobot gives a policy what begins with "observation"; no other is sensed."""
-CAMERAS = tuple(f"observation.images.{side}" for side in SIDES)
+CAMERAS = tuple(f"observation.images.{side}" for side in hemifield.SIDES)
 INDICES = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"}
 INDICES |= {"task_index": "int64", "next.done": "bool"}
 """Features that LeRobot asks for, and the end of an episode."""

@@ -21,7 +21,6 @@ from lgmdjax.learning import dagger
 from lgmdjax.sensors import hemifield
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, episodes, rerender, room_batches
-from lgmdjax.simulation.assembly import CALIBRATED
 from lgmdjax.simulation.episodes import Walk
 from lgmdjax.world.arena import Arena
 
@@ -45,8 +44,9 @@ def find_eyes(recording: Recording) -> Eyes:
     parameters = recording.parameters
     if "eyes" in parameters and "lgmd" in parameters:
         settings = CameraSettings(**parameters["eyes"])
-        constants = {name: float(parameters["lgmd"][name]) for name in CALIBRATED}
-        return Eyes(settings=settings, detector=assembly.fit_detector(lgmd.Params(**constants), settings))
+        return Eyes(
+            settings=settings, detector=assembly.fit_detector(assembly.lgmd_params(parameters["lgmd"]), settings)
+        )
     around = [folder for folder in recording.folder.resolve().parents if (folder / "train").is_dir()]
     runs = [folder for folder in around if (folder / "train" / "controller.safetensors").is_file()]
     robot = assembly.load_robot(runs[0] / "fit-gait", runs[0] / "train") if runs else assembly.load_robot()

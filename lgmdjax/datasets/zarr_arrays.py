@@ -19,7 +19,8 @@ from lgmdjax.datasets import pictures
 from lgmdjax.datasets.recorded import Recording
 from lgmdjax.runtime import storage
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.simulation.episode_tables import FIELDS, ORIGIN, ORIGIN_MEANINGS, SIDES
+from lgmdjax.sensors import hemifield
+from lgmdjax.simulation.episode_tables import FIELDS, ORIGIN, ORIGIN_MEANINGS
 
 ROWS_PER_CHUNK = 2**16
 PICTURES_PER_CHUNK = 256
@@ -60,7 +61,7 @@ def _write_pictures(folder: Path, recording: Recording, eyes: pictures.Eyes) -> 
             (min(PICTURES_PER_CHUNK, rows), height, width), ("row", "height", "width"),
             {"units": "grey", "long_name": f"picture of the {side} eye, row 0 at the top"},
         )
-        for side in SIDES
+        for side in hemifield.SIDES
     ]  # fmt: skip
     first = 0
     for block in _blocks(recording, eyes):

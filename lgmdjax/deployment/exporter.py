@@ -20,7 +20,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.runtime import partial_files, storage
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.simulation import assembly
+from lgmdjax.simulation import assembly, closed_loop
 
 CONTROLLER = "controller.safetensors"
 
@@ -46,11 +46,9 @@ def export(run: Path | None, out: Path, *, width: int | None = None, formats: Se
     if "onnx" in formats:
         onnx_graph.check_installed()
     partial_files.require_empty(out)
-    gait_folder, train_folder = _stage_folders(run)
+    _, train_folder = _stage_folders(run)
     with jax.enable_x64(False):
-        robot = assembly.load_robot(gait_folder, train_folder)
-        if width is not None:
-            robot = assembly.with_resolution(robot, assembly.scale_resolution(robot, width))
+        robot = _load_robot(run, width)
         params = nervous_system.from_robot(robot)
         name = PRETRAINED if run is None else run.resolve().name
         with partial_files.new_folder(out) as folder:
@@ -66,9 +64,20 @@ def export(run: Path | None, out: Path, *, width: int | None = None, formats: Se
     return facts
 
 
+def load(run: Path | None, width: int | None = None) -> nervous_system.Params:
+    """Return the nervous system of a robot, in single precision; arguments and errors as of `export`."""
+    with jax.enable_x64(False):
+        return nervous_system.from_robot(_load_robot(run, width))
+
+
 def read_card(folder: Path) -> JsonObject:
     """Return the card of an exported folder."""
     return storage.read_json(folder / card.FILE)
+
+
+def _load_robot(run: Path | None, width: int | None) -> closed_loop.Params:
+    robot = assembly.load_robot(*_stage_folders(run))
+    return robot if width is None else assembly.with_resolution(robot, assembly.scale_resolution(robot, width))
 
 
 def _stage_folders(run: Path | None) -> tuple[Path, Path]:

@@ -82,7 +82,7 @@ def open_reader(path: Path) -> Iterator[Video]:
             rate=rate,
             count=stream.frames,
             left_out=left_out,
-            frames=lambda width, height: _read_grey(decoded, rate, width, height),
+            frames=lambda width, height: read_grey(decoded, rate, width, height),
         )
 
 
@@ -216,7 +216,7 @@ def _to_declared_end(
         raise InputError(f"expected {declared:.2f} s of video, as {path} declares, got {end:.2f} s; get the whole file")
 
 
-def _read_grey(frames: Iterator[av.VideoFrame], rate: Fraction, width: int, height: int) -> Iterator[Frame]:
+def read_grey(frames: Iterator[av.VideoFrame], rate: Fraction, width: int, height: int) -> Iterator[Frame]:
     """Convert frames to grey, upright and of the given size.
 
     Brightness does not depend on the matrix of the colours (BT.601, 709, 2020), but FFmpeg's conversion is exact for

@@ -12,7 +12,7 @@ import os
 import signal
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 GRACE = 1.5  # s from a signal to the end of the process
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows lacks the last
@@ -63,6 +63,26 @@ def obeying(message: str) -> Iterator[None]:
             signal.signal(number, handler)
         signal.set_wakeup_fd(woken)
         writer.close()  # which ends the thread
+
+
+@contextlib.contextmanager
+def counting() -> Iterator[Callable[[], int]]:
+    """Count signals instead of ending the command, which has to come to an end in order; yield their number so far.
+
+    For code inside of `obeying`, in the main thread. Signals that the process ignores stay ignored.
+    """
+    received: list[int] = []
+    numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers if signal.getsignal(number) != signal.SIG_IGN}
+    woken = signal.set_wakeup_fd(-1)
+    try:
+        for number in before:
+            signal.signal(number, lambda number, _: received.append(number))
+        yield lambda: len(received)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(woken, warn_on_full_buffer=False)
 
 
 def _interrupt(number: int, _: object) -> None:

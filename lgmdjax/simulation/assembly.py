@@ -86,7 +86,7 @@ def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAIN
     switch = make_policies(navigator_params, float(arrays["gain"]), arrays["replayed"])
     smallest = min(header["eyes"]["width"], header["eyes"]["height"])
     schema.check(schema.Integer(1, smallest), header["eyes"].get("pooling", 1), f"{controller}: pooling", "train again")
-    return assemble_robot(gait_folder, read_camera_settings(header), _lgmd_params(header["lgmd"]), switch)
+    return assemble_robot(gait_folder, read_camera_settings(header), lgmd_params(header["lgmd"]), switch)
 
 
 def assemble_robot(
@@ -203,9 +203,10 @@ def load_detector(folder: Path) -> lgmd.Params:
     path = folder / "calibration.json"
     calibration = read_json(path)
     schema.check(LGMD, calibration, str(path), "run `lgmdjax collect` again")
-    return _lgmd_params(calibration)
+    return lgmd_params(calibration)
 
 
-def _lgmd_params(constants: JsonObject) -> lgmd.Params:
+def lgmd_params(constants: JsonObject) -> lgmd.Params:
+    """Return an LGMD with the constants of `lgmd.SCALARS`, as a calibration or a header has them."""
     threshold, suppression, inhibition = (float(constants[name]) for name in lgmd.SCALARS)
     return lgmd.Params(threshold=threshold, suppression=suppression, inhibition=inhibition)

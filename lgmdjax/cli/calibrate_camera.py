@@ -1,0 +1,35 @@
+"""`lgmdjax calibrate-camera`: a lens from pictures of a chessboard, and a picture of what is left of straight lines."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lgmdjax.cli.hardware_flags import CalibrateCameraFlags
+from lgmdjax.errors import InputError
+from lgmdjax.hardware import chessboard, lens
+from lgmdjax.reporting.figures import style
+from lgmdjax.runtime import partial_files
+
+SUFFIXES = (".json", ".yaml", ".yml")
+
+
+def calibrate(flags: CalibrateCameraFlags) -> Iterator[str]:
+    """Calibrate a camera; yield lines about the result and the names of the files."""
+    if flags.out.suffix not in SUFFIXES:
+        raise InputError(f"expected --out with a name that ends in {', '.join(SUFFIXES)}, got {flags.out}; rename it")
+    if not flags.folder.is_dir():
+        raise InputError(
+            f"expected a folder with pictures of a chessboard, got {flags.folder}, which is none; name another"
+        )
+    board = chessboard.parse_board(flags.board, flags.square)
+    found = chessboard.calibrate(flags.folder, board, flags.model)
+    with partial_files.replacing(flags.out.with_suffix(".png")) as partial:
+        partial.write_bytes(style.to_png(chessboard.plot(found)))
+    lens.write(flags.out, found.lens)
+    left = np.rad2deg(chessboard.bends(found))
+    yield f"{len(found.used)} pictures used, {len(found.unused)} without the whole board"
+    yield f"corners are {found.error:.2f} px beside where the lens puts them (root mean square)"
+    mean = np.sqrt(np.mean(left**2))
+    yield f"rows are straight to {mean:.3f} degrees (root mean square), {np.abs(left).max():.3f} at most"
+    yield str(flags.out)
+    yield str(flags.out.with_suffix(".png"))

@@ -1,0 +1,129 @@
+"""The log of a drive on disk: Parquet, a row for each step of the servos' loop, with units in every file.
+
+| column                            | unit    | what                                                        |
+| --------------------------------- | ------- | ----------------------------------------------------------- |
+| time                              | s       | since the start, in the robot's time                        |
+| mode, reason                      | -       | of the supervisor; reason is empty until the robot sits     |
+| frame, frame_age                  | -, s    | number of the newest pictures, and how old they are         |
+| u_*, velocity_*                   | 1, 0.05 m/s | of LGMDs and navigator, for the newest pictures         |
+| target_0 .. target_17             | rad     | set points that were sent                                   |
+| joint_0 .. joint_17               | rad     | positions that were read last                               |
+| load_*, temperature_*             | 1, degC | likewise, by joint; loads are fractions of the stall torque |
+| voltage                           | V       | median over the servos                                      |
+| bus_failures, stops               | -       | answers missed so far, requests to stop                     |
+
+Joints are in the order of `joint_map.JOINT_NAMES`. Rows are written in chunks of `CHUNK_ROWS`, each a file that gets
+its name when it is complete: a process that is killed loses the present chunk alone.
+"""
+
+import json
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import partial_files, versions
+from lgmdjax.runtime.storage import JsonObject
+
+FORMAT, VERSION = "lgmdjax drive", 1
+CHUNK_ROWS = 2000
+SIDES = ("left", "right")
+JOINTS = 18
+UNITS: Mapping[str, str] = {
+    **{"time": "s", "mode": "", "reason": "", "frame": "", "frame_age": "s"},
+    **{f"u_{side}": "1" for side in SIDES},
+    **{f"velocity_{side}": "0.05 m/s" for side in SIDES},
+    **{f"target_{joint}": "rad" for joint in range(JOINTS)},
+    **{f"joint_{joint}": "rad" for joint in range(JOINTS)},
+    **{f"load_{joint}": "1" for joint in range(JOINTS)},
+    **{f"temperature_{joint}": "degC" for joint in range(JOINTS)},
+    **{"voltage": "V", "bus_failures": "", "stops": ""},
+}
+"""Columns and their units."""
+
+Row = dict[str, float | int | str | None]
+
+
+class Writer:
+    """Writes rows into a folder of its own; use it in a `with` block.
+
+    Args:
+        folder: made if need be; it must have no log yet.
+        facts: JSON values for the header.
+    """
+
+    def __init__(self, folder: Path, facts: JsonObject):
+        partial_files.require_empty(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise partial_files.not_writable(folder, error) from error
+        self.folder, self._rows, self._chunks = folder, list[Row](), 0
+        header = {"format": FORMAT, "version": VERSION, "units": UNITS, "facts": facts}
+        self._metadata = {"lgmdjax": json.dumps(header | {"versions": versions.installed()})}
+        self._thread, self._written = ThreadPoolExecutor(1), list[Future[None]]()
+
+    def __enter__(self) -> "Writer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.flush()
+        self._thread.shutdown()
+        for written in self._written:
+            written.result()  # raises what the thread did
+
+    def add(self, row: Row) -> None:
+        """Add a row; a full chunk is written on a thread of its own, since a robot does not wait for a disk."""
+        self._rows.append(row)
+        if len(self._rows) >= CHUNK_ROWS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Begin to write the rows that are not written yet."""
+        if self._rows:
+            path = self.folder / f"drive-{self._chunks:05d}.parquet"
+            self._written.append(self._thread.submit(_write, path, self._rows, self._metadata))
+            self._rows, self._chunks = [], self._chunks + 1
+
+
+def _write(path: Path, rows: list[Row], metadata: dict[str, str]) -> None:
+    """Write a chunk, whole or not at all."""
+    table = pa.table({name: [row.get(name) for row in rows] for name in UNITS}, metadata=metadata)
+    with partial_files.replacing(path) as partial:
+        pq.write_table(table, partial, compression="zstd")
+
+
+def read(folder: Path) -> pa.Table:
+    """Return the log of a drive as one table; raise `InputError` for a folder without one.
+
+    ```python
+    log = lj.hardware.drive_log.read(Path("runs/drive/first"))
+    log["voltage"].to_numpy()
+    ```
+    """
+    files = sorted(folder.glob("drive-*.parquet"))
+    if not files:
+        raise InputError(f"{folder}: expected the log of a drive, got no drive-*.parquet; `lgmdjax drive` writes one")
+    tables = []
+    for path in files:
+        try:
+            table = pq.read_table(path)
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(
+                f"{path}: expected a whole Parquet file, got {one_line(error)[:200]}; remove it"
+            ) from error
+        header = json.loads((table.schema.metadata or {}).get(b"lgmdjax", b"{}"))
+        if header.get("format") != FORMAT or header.get("version") != VERSION:
+            raise InputError(f"{path}: expected a drive's log of version {VERSION}, got another kind of file; move it")
+        tables.append(table)
+    return pa.concat_tables(tables, promote_options="permissive")
+
+
+def joints(table: pa.Table, name: str) -> np.ndarray:
+    """Return the columns of a quantity of all joints, (rows, 18); nan where it was not known."""
+    columns = [table[f"{name}_{joint}"].cast(pa.float64()).to_numpy() for joint in range(JOINTS)]
+    return np.stack(columns, axis=1)
