@@ -39,7 +39,7 @@ from lgmdjax.evaluation import metrics
 from lgmdjax.learning import shac as shac_learning
 from lgmdjax.learning.checkpoints import Checkpoints
 from lgmdjax.runtime.storage import JsonObject, write_json
-from lgmdjax.simulation import assembly, recording, room_batches
+from lgmdjax.simulation import assembly, closed_loop, recording, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE
 from lgmdjax.simulation.settings import BenchmarkRooms
 
@@ -172,7 +172,9 @@ def score(out: Path = OUT, robots: int = 16, seconds: float = 60.0) -> None:
         "blind": "blind",
         "random": "random",
     }
-    drivers = {name: (robot, policy) for name, policy in baselines.items()}
+    drivers: dict[str, tuple[closed_loop.Params, PolicyName]] = {
+        name: (robot, policy) for name, policy in baselines.items()
+    }
     for path in sorted(out.glob(f"*/{FILE}")):
         drivers[path.parent.name] = assembly.with_policy(robot, "learned", navigator.load(path)[0]), "learned"
     rows: list[JsonObject] = []

@@ -271,7 +271,7 @@ def learn(learner: Learner, found: tuple[Weights, Sample], *, settings: Settings
         squares = (critic.value(weights, samples.features) - returns) ** 2
         return jnp.sum(jnp.where(counts, squares, 0.0)) / jnp.maximum(jnp.sum(counts), 1)
 
-    def fit(carry: tuple[Weights, optax.OptState], _: None) -> tuple[tuple[Weights, optax.OptState], Array]:
+    def fit(carry: tuple[PyTree, optax.OptState], _: None) -> tuple[tuple[PyTree, optax.OptState], Array]:
         weights, memory = carry
         before, slope = jax.value_and_grad(error)(weights)
         updates, memory = critic_optimiser.update(slope, memory)
@@ -279,7 +279,7 @@ def learn(learner: Learner, found: tuple[Weights, Sample], *, settings: Settings
 
     carry = learner.critic, learner.critic_memory
     (weights, critic_memory), errors = jax.lax.scan(fit, carry, length=settings.critic_steps)
-    target = optax.incremental_update(weights, learner.target, settings.critic_average)
+    target: PyTree = optax.incremental_update(weights, learner.target, settings.critic_average)
     memories = {"actor_memory": actor_memory, "critic_memory": critic_memory}
     return Learner(actor=actor, critic=weights, target=target, **memories), jnp.sqrt(errors[0])
 
