@@ -167,6 +167,7 @@ def test_all_learners_train_for_the_same_time_and_have_a_row(finetuned, tmp_path
     assert (folder / "closed_loop_finetune.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_every_window_of_a_fit_is_logged(params, monkeypatch):
     """Two rooms of three windows, whose gradient is a stand-in."""
     found = rollout_gradient.Gradient(
