@@ -47,7 +47,7 @@ def measure(step: Callable[[], object], robots: int, seconds: float) -> float:
     return robots * count / passed
 
 
-def measure_gymnasium(name: str, robots: int, seconds: float, **settings: str) -> float:
+def measure_gymnasium(name: str, robots: int, seconds: float, **settings: Any) -> float:
     """Return steps a second of an environment of Gymnasium; it is reset where an episode ends."""
     if robots > 1:
         many = gymnasium.make_vec(name, num_envs=robots, **settings)

@@ -241,7 +241,7 @@ def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns
     return hemifield.outermost_first(pictures) if params.falloff else pictures
 
 
-def _to_pixels(params: lgmd.Params, shape: tuple[int, int], layer: Float[Array, "2 rows columns"]) -> Array:
+def _to_pixels(params: lgmd.Params, shape: tuple[int, ...], layer: Float[Array, "2 rows columns"]) -> Array:
     """Return a layer with a value for each pixel, in the order of the picture."""
     if params.pooling > 1:
         sizes = zip(shape, layer.shape[1:], strict=True)

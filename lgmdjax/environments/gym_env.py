@@ -92,8 +92,8 @@ class HexapodEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             observation=observation, action=action, room=room, reward=reward, robot=robot, seconds=seconds
         )
         self.render_mode = _check_render_mode(render_mode)
-        self.observation_space = observation_space(self.functional)
-        self.action_space = action_space(self.functional)
+        self._observed, self._commanded = observation_space(self.functional), action_space(self.functional)
+        self.observation_space, self.action_space = self._observed, self._commanded
         self.state: State | None = None
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
@@ -112,7 +112,7 @@ class HexapodEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Carry out an action for one frame, 1/30 s; return observation, reward, terminated, truncated and info."""
         state = _require_state(self.state)
-        checked = _check_action(action, self.action_space.shape)
+        checked = _check_action(action, self._commanded.shape)
         transition = _step(self.functional, jax.random.key(0), state, checked)
         self.state = transition.state
         return (
@@ -129,10 +129,10 @@ class HexapodEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def _no_action(self) -> Array:
-        return jnp.zeros(self.action_space.shape, float)
+        return jnp.zeros(self._commanded.shape, float)
 
     def _to_numpy(self, observation: Array) -> np.ndarray:
-        return np.asarray(_to_space(observation, self.observation_space))
+        return np.asarray(_to_space(observation, self._observed))
 
 
 class HexapodVectorEnv(VectorEnv[Array, Array, Array]):
@@ -164,10 +164,10 @@ class HexapodVectorEnv(VectorEnv[Array, Array, Array]):
         )
         self.num_envs = num_envs
         self.render_mode = _check_render_mode(render_mode)
-        self.single_observation_space = observation_space(self.functional)
-        self.single_action_space = action_space(self.functional)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._observed, self._commanded = observation_space(self.functional), action_space(self.functional)
+        self.single_observation_space, self.single_action_space = self._observed, self._commanded
+        self.observation_space = batch_space(self._observed, num_envs)
+        self.action_space = batch_space(self._commanded, num_envs)
         self.state: State | None = None
         self.key = jax.random.key(0)
 
@@ -183,17 +183,19 @@ class HexapodVectorEnv(VectorEnv[Array, Array, Array]):
         super().reset(seed=seed)
         self.key = jax.random.key(int(self.np_random.integers(2**31)))
         before = ended_batch(self.functional, self.key, robots=self.num_envs)
-        begun, self.key = step_batch(self.functional, self.key, before, jnp.zeros(self.action_space.shape, float))
+        begun, self.key = step_batch(
+            self.functional, self.key, before, jnp.zeros((self.num_envs, *self._commanded.shape), float)
+        )
         self.state = begun.state
-        return _to_space(begun.observation, self.single_observation_space), {}
+        return _to_space(begun.observation, self._observed), {}
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, Info]:
         """Carry out an action of each robot for one frame, 1/30 s; return what `HexapodEnv.step` does, batched."""
         state = _require_state(self.state)
-        checked = _check_action(actions, (self.num_envs, *self.single_action_space.shape))
+        checked = _check_action(actions, (self.num_envs, *self._commanded.shape))
         transition, self.key = step_batch(self.functional, self.key, state, checked)
         self.state = transition.state
-        observation = _to_space(transition.observation, self.single_observation_space)
+        observation = _to_space(transition.observation, self._observed)
         ended = transition.terminated, transition.truncated
         return observation, transition.reward, *ended, dict(vars(transition.outcome))
 

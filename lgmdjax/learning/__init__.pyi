@@ -1,6 +1,5 @@
 from . import behaviour_cloning as behaviour_cloning
 from . import checkpoints as checkpoints
-from . import critic as critic
 from . import dagger as dagger
 from . import finetuning as finetuning
 from . import gait_objective as gait_objective
@@ -9,4 +8,3 @@ from . import lgmd_grid_search as lgmd_grid_search
 from . import rollout_gradient as rollout_gradient
 from . import sequences as sequences
 from . import settings as settings
-from . import shac as shac

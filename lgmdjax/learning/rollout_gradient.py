@@ -37,7 +37,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +50,6 @@ from lgmdjax.runtime.export_cache import cached_jit
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import closed_loop, rollout, sharding
 from lgmdjax.simulation.closed_loop import GradPath, Params, Record, Room, State
-
-Tree = TypeVar("Tree")
 
 SMOOTH_WIDTH = 0.3  # of a smooth threshold, relative to the threshold
 
@@ -73,7 +70,7 @@ class Gradient:
     """Loss and gradient of a window, over a batch of robots. Robots with `nonfinite` are left out of the means."""
 
     loss: Float[Array, ""]  # mean
-    grad: PyTree  # mean of the clipped gradients, in units of param_scales
+    grad: controller.Params  # mean of the clipped gradients, in units of param_scales
     norms: Float[Array, " robots"]  # of each robot's gradient, before clipping
     standard_error: Float[Array, ""]  # of the mean gradient; the norm expected by chance if the true gradient is zero
     nonfinite: Bool[Array, " robots"]  # robots whose loss or gradient is not finite
@@ -151,28 +148,28 @@ def gradient(
         return per_robot_grad(lambda own: losses(own, params, model, rooms, states, settings=settings), copies)
 
     (values, (states, record)), grads = sharding.shard_robots(work, rooms, states)
-    return average(values, jax.tree.map(jnp.multiply, grads, param_scales), settings.clip), states, record
+    return _average(values, jax.tree.map(jnp.multiply, grads, param_scales), settings.clip), states, record
 
 
 def per_robot_grad(
-    losses: Callable[[Tree], tuple[Float[Array, " robots"], PyTree]], params: Tree
-) -> tuple[tuple[Float[Array, " robots"], PyTree], Tree]:
+    losses: Callable[[controller.Params], tuple[Float[Array, " robots"], PyTree]], controller_params: controller.Params
+) -> tuple[tuple[Float[Array, " robots"], PyTree], controller.Params]:
     """Return (losses, auxiliary output), and the gradient of each robot's loss by its own parameters.
 
     Robots do not interact, so one backward pass of the sum of all losses gives all gradients.
     """
 
-    def total(params: Tree) -> tuple[Float[Array, ""], PyTree]:
-        values, aux = losses(params)
+    def total(controller_params: controller.Params) -> tuple[Float[Array, ""], PyTree]:
+        values, aux = losses(controller_params)
         return jnp.sum(values), (values, aux)
 
-    grads, found = jax.grad(total, has_aux=True)(params)
+    grads, found = jax.grad(total, has_aux=True)(controller_params)
     return found, grads
 
 
-def broadcast_params(params: Tree, robots: int) -> Tree:
+def broadcast_params(controller_params: controller.Params, robots: int) -> controller.Params:
     """Return a copy of the parameters for each robot of a batch."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *jnp.shape(leaf))), params)
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (robots, *jnp.shape(leaf))), controller_params)
 
 
 def learned_only(params: Params) -> Params:
@@ -187,8 +184,8 @@ def smooth_thresholds(params: Params) -> Params:
     return replace(params, controller=replace(params.controller, lgmd=smoothed))
 
 
-def average(values: Float[Array, " robots"], grads: PyTree, clip: float) -> Gradient:
-    """Average losses and clipped gradients over the robots for which both are finite; leaves have an axis of robots."""
+def _average(values: Float[Array, " robots"], grads: controller.Params, clip: float) -> Gradient:
+    """Average losses and clipped gradients over the robots for which both are finite."""
     norms: Array = jax.vmap(optax.tree.norm)(grads)
     nonfinite = ~(jnp.isfinite(values) & jnp.isfinite(norms))
     count = jnp.maximum(jnp.sum(~nonfinite), 1)

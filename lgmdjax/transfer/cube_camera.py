@@ -166,7 +166,7 @@ def _matrices(directions: np.ndarray, pixel: np.ndarray, pixels: int, face: int)
         column, row = (_to_pixel(side @ d / depth, face) for side in (np.asarray(each.right), -each.up()))
         entries = np.full(mine.sum(), weight)
         shape = (pixels, face * face)
-        matrices[name] = sparse.coo_matrix((entries, (pixel[mine], row * face + column)), shape).tocsr()
+        matrices[name] = sparse.csr_matrix((entries, (pixel[mine], row * face + column)), shape)
     return matrices
 
 

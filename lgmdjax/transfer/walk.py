@@ -131,7 +131,7 @@ class _Batch:
             self.resets, self.is_first = self.resets + lifted, self.is_first | lifted
             keys = jax.vmap(jax.random.fold_in)(self.keys, jnp.asarray(self.resets))
             self.states = nerves.restart_batch(self.robot, self.faults, self.states, keys, jnp.asarray(lifted))
-            for index in np.flatnonzero(lifted):
+            for index in np.flatnonzero(lifted).tolist():
                 body = self.bodies[index]
                 robot_model.reset(body.model, body.data, body.starts[self.resets[index] % len(body.starts)])
 
@@ -149,7 +149,7 @@ class _Batch:
         self.states, targets = nerves.move_batch(self.robot, self.faults, self.states)
         targets = np.asarray(targets, float).reshape(len(self.bodies), -1)
         touched = np.zeros(len(self.bodies), bool)
-        for index in np.flatnonzero(self.ok):
+        for index in np.flatnonzero(self.ok).tolist():
             body = self.bodies[index]
             body.data.ctrl[:] = targets[index]
             mujoco.mj_step(body.model, body.data)

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import Array
 
 from lgmdjax.world import arena, meshes, photographs
 from lgmdjax.world.arena import Arena
@@ -141,7 +142,7 @@ def _add_texture(spec: mujoco.MjSpec, name: photographs.TextureName) -> None:
 
 
 def _add_material(
-    spec: mujoco.MjSpec, name: str, texture: np.ndarray, rng: np.random.Generator, *, repeat: float = 1.0
+    spec: mujoco.MjSpec, name: str, texture: np.ndarray | Array, rng: np.random.Generator, *, repeat: float = 1.0
 ) -> None:
     """Add a photograph as a material, or its grey where a room's `texture` has no contrast (or there are none)."""
     brightness, contrast = float(texture[0]), float(texture[1])

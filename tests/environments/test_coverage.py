@@ -20,8 +20,8 @@ def follow(path):
     return jax.lax.scan(coverage.step, coverage.init(path[0]), path[1:])[1]
 
 
-def line(*ends, points=401):
-    return jnp.asarray(np.linspace(*ends, points))
+def line(first, last, points=401):
+    return jnp.asarray(np.linspace(first, last, points))
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, 1.1])

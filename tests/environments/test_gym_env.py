@@ -40,10 +40,12 @@ def robot():
 
 
 def rooms(*starts):
-    """One room with a box on the left, with these starts."""
+    """One room with a box on the left, with these starts; always four, so that all share compiled programs."""
     boxes = arena.make_prisms([[0.75, 0.4]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
     scene = arena.empty_room((5.0, 4.0), boxes=boxes)
-    return room_batches.stack_rooms([closed_loop.Room(arena=scene, starts=jnp.asarray(starts), key=jax.random.key(0))])
+    return room_batches.stack_rooms(
+        [closed_loop.Room(arena=scene, starts=jnp.asarray(starts * (4 // len(starts))), key=jax.random.key(0))]
+    )
 
 
 FREE, INSIDE = (0.0, 0.0, 0.0), (0.5, 0.4, 0.0)  # half a metre from the box, and within it
@@ -177,7 +179,7 @@ def test_joint_commands_move_the_joints_that_they_name(vector):
 
 
 def test_the_derivative_of_a_reward_is_that_of_central_differences(robot):
-    """Through three frames of physics and the laser's scan, by the commanded velocities."""
+    """Through three frames of physics, after the one that begins the episode, by the commanded velocities."""
     environment = functional.make(robot=robot, room=rooms(FREE), observation="laser", reward="floor")
 
     def total(action):
@@ -185,7 +187,7 @@ def test_the_derivative_of_a_reward_is_that_of_central_differences(robot):
             transition = environment.step(jax.random.key(0), state, action)
             return transition.state, transition.reward
 
-        return jnp.sum(jax.lax.scan(frame, environment.reset(jax.random.key(0))[1], length=3)[1])
+        return jnp.sum(jax.lax.scan(frame, environment.ended(jax.random.key(0)), length=4)[1])
 
     along = jax.jit(lambda action, direction: jax.jvp(total, (action,), (direction,)))
     action, direction, step = jnp.asarray([1.1, 0.9]), jnp.asarray([1.0, 0.4]), 1e-5
@@ -225,7 +227,7 @@ def test_wrong_arguments_are_named(unchecked, robot, arguments, message):
 
 def test_rooms_that_do_not_fit_are_refused(unchecked, robot):
     single = jax.tree.map(lambda leaf: leaf[0], rooms(FREE))
-    with pytest.raises(InputError, match=r"expected a batch of rooms.*got \(1, 3\)"):
+    with pytest.raises(InputError, match=r"expected a batch of rooms.*got \(4, 3\)"):
         functional.make(robot=robot, room=single)
     hall = replace(rooms(FREE), arena=jax.tree.map(lambda leaf: leaf[None], arena.empty_room((20.0, 4.0))))
     with pytest.raises(InputError, match=r"expected sides up to 16 m, got 20 m"):

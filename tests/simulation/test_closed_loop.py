@@ -45,10 +45,13 @@ def params():
 
 @pytest.fixture(scope="module")
 def room():
-    """A start half a metre from a box on the left; a box straight ahead would be a tie, which is not symmetric."""
+    """Half a metre from a box on the left; a box straight ahead would be a tie, which is not symmetric.
+
+    All rooms have two starts, so that all rollouts are one program.
+    """
     boxes = arena.make_prisms([[0.75, 0.4]], 0.2, 0.8, texture=(150.0, 0.8, 0.3, 0.3))
     scene = arena.empty_room((5.0, 4.0), boxes=boxes)
-    return closed_loop.Room(arena=scene, starts=jnp.zeros((1, 3)), key=jax.random.key(0))
+    return closed_loop.Room(arena=scene, starts=jnp.zeros((2, 3)), key=jax.random.key(0))
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +159,7 @@ def test_blind_rollout_is_the_same_without_rendering(start, room, run):
 @pytest.mark.slow
 def test_chunks_of_a_batch_are_one_rollout(run, init, params, model, room):
     """Of four robots, two on each device, each with a start of its own."""
-    starts = jnp.asarray([[[0.0, 0.0, 0.3 * k]] for k in range(4)])
+    starts = jnp.asarray([[[0.0, 0.0, 0.3 * k]] * 2 for k in range(4)])
     rooms = room_batches.stack_rooms([room.replace(starts=start) for start in starts])
     teacher = activated(params, jnp.asarray(policies.POLICIES.index(policies.TEACHER)))
     chunks = rollout.rollout_chunks(
