@@ -13,7 +13,8 @@ import synthetic
 import lgmdjax as lj
 from lgmdjax import html
 from lgmdjax.evaluation import metrics
-from lgmdjax.simulation import assembly, room_batches
+from lgmdjax.simulation import assembly
+from lgmdjax.simulation.closed_loop import Room
 from lgmdjax.world import floor_plan
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -112,7 +113,8 @@ def test_a_room_is_drawn_from_above():
 
 
 def test_rooms_and_walks_have_pictures_and_tables():
-    rooms = room_batches.random_rooms(jax.random.key(0), 6)
+    arenas = jax.tree.map(lambda leaf: jnp.stack([leaf] * 6), synthetic.room())
+    rooms = Room(arena=arenas, starts=jnp.zeros((6, 1, 3)), key=jax.random.split(jax.random.key(0), 6))
     assert rooms._repr_html_().count("<svg") == 4
     one = jax.tree.map(lambda leaf: leaf[0], rooms)
     assert one._repr_html_().count("<svg") == one.arena._repr_html_().count("<svg") == 1

@@ -230,9 +230,10 @@ def _step(
     seen, response = jax.vmap(partial(lgmd.step, params.lgmd))(seen, ordered)
     views = alarm.View(frame=pictures, excitation=response.excitation)
     adapting, adapted = jax.vmap(partial(alarm.step, params.alarm))(adapting, views)
-    rows = [response.u, response.feed_forward, response.excitation, adapted.adapted, adapted.alarm]
-    shown = jax.tree.map(partial(_to_pixels, params.lgmd, pictures.shape[1:]), layers)
-    return (seen, adapting), jnp.stack(rows), shown
+    curves = [response.u, response.feed_forward, response.excitation, adapted.adapted, adapted.alarm]
+    _, rows, columns = pictures.shape
+    shown = jax.tree.map(partial(_to_pixels, params.lgmd, (rows, columns)), layers)
+    return (seen, adapting), jnp.stack(curves), shown
 
 
 def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns"]) -> Float[Array, "2 rows columns"]:
@@ -240,7 +241,7 @@ def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns
     return hemifield.outermost_first(pictures) if params.falloff else pictures
 
 
-def _to_pixels(params: lgmd.Params, shape: tuple[int, int], layer: Float[Array, "2 rows columns"]) -> Array:
+def _to_pixels(params: lgmd.Params, shape: tuple[int, ...], layer: Float[Array, "2 rows columns"]) -> Array:
     """Return a layer with a value for each pixel, in the order of the picture."""
     if params.pooling > 1:
         sizes = zip(shape, layer.shape[1:], strict=True)

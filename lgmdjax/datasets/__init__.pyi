@@ -5,6 +5,7 @@ from . import lerobot as lerobot
 from . import lerobot_features as lerobot_features
 from . import pictures as pictures
 from . import recorded as recorded
+from . import recorded_rooms as recorded_rooms
 from . import statistics as statistics
 from . import tables as tables
 from . import zarr_arrays as zarr_arrays

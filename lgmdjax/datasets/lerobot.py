@@ -244,9 +244,10 @@ def _statistics(
     values: Mapping[str, np.ndarray], histograms: _Histograms | None, episodes: list[_Episode]
 ) -> dict[str, statistics.Statistics]:
     found = {name: statistics.of_values(value) for name, value in values.items()}
-    for side, camera in enumerate(CAMERAS if histograms is not None else ()):
-        counts = sum(histograms.by_episode[one.number][side] for one in episodes)
-        found[camera] = statistics.of_pictures(counts, sum(map(len, episodes)))
+    if histograms is not None:
+        both = np.sum([histograms.by_episode[one.number] for one in episodes], axis=0)
+        for camera, counts in zip(CAMERAS, both, strict=True):
+            found[camera] = statistics.of_pictures(counts, sum(map(len, episodes)))
     return found
 
 

@@ -36,8 +36,8 @@ INDICES |= {"task_index": "int64", "next.done": "bool"}
 def info(episodes: int, frames: int, eyes: Eyes | None) -> JsonObject:
     """Return meta/info.json of a data set with this many episodes and frames."""
     features: JsonObject = {name: _describe(name) for name in FEATURES}
-    for camera in CAMERAS if eyes is not None else ():
-        features[camera] = _describe_video(eyes)
+    if eyes is not None:
+        features |= {camera: _describe_video(eyes) for camera in CAMERAS}
     for name, dtype in INDICES.items():
         features[name] = {"dtype": dtype, "shape": [1], "names": None}
     return {

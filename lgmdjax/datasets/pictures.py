@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
+from lgmdjax.datasets import recorded_rooms
 from lgmdjax.datasets.recorded import Recording
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
-from lgmdjax.evaluation import trials
-from lgmdjax.learning import dagger
 from lgmdjax.sensors import hemifield
 from lgmdjax.sensors.settings import CameraSettings
-from lgmdjax.simulation import assembly, episodes, rerender, room_batches
+from lgmdjax.simulation import assembly, episodes, rerender
 from lgmdjax.simulation.episodes import Walk
 from lgmdjax.world.arena import Arena
 
@@ -55,25 +54,11 @@ def find_eyes(recording: Recording) -> Eyes:
 
 def find_rooms(recording: Recording) -> list[Arena]:
     """Return the room of each walk, made again from seeds; raise `InputError` if the header does not tell how."""
-    parameters, walks = recording.parameters, recording.walks
-    if "trial" in parameters:
-        rooms = trials.sample_rooms(parameters["trial"], parameters["seeds"], walks[0].seed).arena
-        return [_pick(rooms, walk.room) for walk in walks]
-    if "round" in parameters:
-        episode = dagger.FIRST_LEARNER_EPISODE + parameters["round"]
-        rooms = room_batches.training_rooms(walks[0].seed, episode, len(walks)).arena
-        return [_pick(rooms, walk.room) for walk in walks]
-    if "robots" in parameters:
-        count = parameters["robots"]
-        batches = {
-            episode: room_batches.training_rooms(seed, episode, count).arena
-            for episode, seed in {walk.episode: walk.seed for walk in walks}.items()
-        }
-        return [_pick(batches[walk.episode], walk.room % count) for walk in walks]
-    raise InputError(
-        f"expected walks of collect, of a round of DAgger or of a trial for --video, got {recording.folder} recorded "
-        f"with {', '.join(parameters) or 'nothing'}; leave --video out"
-    )
+    walks = recording.walks
+    try:
+        return recorded_rooms.find_rooms(recording.parameters, walks, len(walks), recording.folder)
+    except InputError as error:
+        raise InputError(f"{error}: leave --video out") from error
 
 
 def render(eyes: Eyes, room: Arena, walk: Walk) -> Iterator[Pictures]:
@@ -121,7 +106,3 @@ def respond(
 
     start = jax.vmap(partial(lgmd.init, detector))(pictures[0])
     return jax.lax.scan(frame, start, (pictures, is_first))[1]
-
-
-def _pick(rooms: Arena, index: int) -> Arena:
-    return jax.tree.map(lambda leaf: leaf[index], rooms)

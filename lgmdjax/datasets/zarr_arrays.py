@@ -46,8 +46,8 @@ def write(folder: Path, recording: Recording, eyes: pictures.Eyes | None) -> Non
 
 
 def _write_array(path: Path, values: np.ndarray, axes: tuple[str, ...], attributes: JsonObject) -> None:
-    chunk = (min(ROWS_PER_CHUNK, len(values)), *values.shape[1:])
-    store = _create(path, values.shape, values.dtype, chunk, ("row", *axes), attributes)
+    described = {"dimension_names": ["row", *axes], "attributes": attributes}
+    store = _create(path, values.shape, values.dtype, ROWS_PER_CHUNK, described)
     store.write(values).result()
 
 
@@ -55,14 +55,12 @@ def _write_pictures(folder: Path, recording: Recording, eyes: pictures.Eyes) -> 
     """Write the pictures in whole chunks, since a chunk is compressed anew with each write."""
     height, width = eyes.settings.height, eyes.settings.width
     rows = sum(map(len, recording.walks))
-    stores = [
-        _create(
-            folder / f"pictures_{side}", (rows, height, width), np.dtype(np.uint8),
-            (min(PICTURES_PER_CHUNK, rows), height, width), ("row", "height", "width"),
-            {"units": "grey", "long_name": f"picture of the {side} eye, row 0 at the top"},
-        )
-        for side in hemifield.SIDES
-    ]  # fmt: skip
+    stores = []
+    for side in hemifield.SIDES:
+        attributes = {"units": "grey", "long_name": f"picture of the {side} eye, row 0 at the top"}
+        described = {"dimension_names": ["row", "height", "width"], "attributes": attributes}
+        path, shape = folder / f"pictures_{side}", (rows, height, width)
+        stores.append(_create(path, shape, np.dtype(np.uint8), PICTURES_PER_CHUNK, described))
     first = 0
     for block in _blocks(recording, eyes):
         for side, store in enumerate(stores):
@@ -86,17 +84,16 @@ def _blocks(recording: Recording, eyes: pictures.Eyes) -> Iterator[pictures.Pict
 
 
 def _create(
-    path: Path, shape: tuple[int, ...], dtype: np.dtype, chunk: tuple[int, ...], axes: tuple[str, ...],
-    attributes: JsonObject,
-) -> tensorstore.TensorStore:  # fmt: skip
-    """Create an array with named axes."""
+    path: Path, shape: tuple[int, ...], dtype: np.dtype, rows_per_chunk: int, described: JsonObject
+) -> tensorstore.TensorStore:
+    """Create an array with the names of its axes and its attributes (`described`)."""
+    chunk = [min(rows_per_chunk, shape[0]), *shape[1:]]
     metadata = {
         "shape": list(shape),
         "data_type": dtype.name,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk)}},
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
         "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}, COMPRESSION],
-        "dimension_names": list(axes),
-        "attributes": attributes,
+        **described,
     }
     store = {"driver": "file", "path": f"{path.resolve()}/"}
     return tensorstore.open({"driver": "zarr3", "kvstore": store, "metadata": metadata}, create=True).result()

@@ -72,15 +72,7 @@ def calibrate(folder: Path, board: Board, model: Model) -> Calibration:
     Raises InputError for too few pictures with the whole board, for pictures of several sizes, and for a bad fit.
     """
     check_installed()
-    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
-    if not paths:
-        raise InputError(f"expected a folder with pictures of a chessboard, got none in {folder}; take ten or more")
-    pictures = {path.name: read_grey(path) for path in paths}
-    sizes = {picture.shape[::-1] for picture in pictures.values()}
-    if len(sizes) > 1:
-        raise InputError(
-            f"expected pictures of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))} in {folder}"
-        )
+    pictures, size = _read_pictures(folder)
     found = {name: find_corners(picture, board) for name, picture in pictures.items()}
     used = {name: corners for name, corners in found.items() if corners is not None}
     if len(used) < MIN_BOARDS:
@@ -88,9 +80,7 @@ def calibrate(folder: Path, board: Board, model: Model) -> Calibration:
             f"expected {MIN_BOARDS} or more pictures of a whole board with {board.columns}x{board.rows} inner corners, "
             f"got {len(used)} of {len(pictures)} in {folder}; take more, or correct --board"
         )
-    error, K, D = _fit(list(used.values()), board, model, sizes.pop())
-    (picture, *_) = pictures.values()
-    calibrated = Lens(model=model, size=(picture.shape[1], picture.shape[0]), K=K, D=D)
+    error, K, D = _fit(list(used.values()), board, model, size)
     if not error < MAX_ERROR:
         raise InputError(
             f"expected corners within {MAX_ERROR:g} px of a {model} lens, got {error:.2g} px; try the other --model, "
@@ -98,12 +88,26 @@ def calibrate(folder: Path, board: Board, model: Model) -> Calibration:
         )
     shape = (len(used), board.rows, board.columns, 2)
     return Calibration(
-        lens=calibrated,
+        lens=Lens(model=model, size=size, K=K, D=D),
         error=error,
         corners=np.stack(list(used.values())).reshape(shape),
         used=tuple(used),
-        unused=tuple(found.keys() - used.keys()),
+        unused=tuple(name for name in found if name not in used),
     )
+
+
+def _read_pictures(folder: Path) -> tuple[dict[str, UInt8[np.ndarray, "height width"]], tuple[int, int]]:
+    """Return the pictures of a folder by name, and their width and height [px]."""
+    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise InputError(f"expected a folder with pictures of a chessboard, got none in {folder}; take ten or more")
+    pictures = {path.name: read_grey(path) for path in paths}
+    sizes = {(picture.shape[1], picture.shape[0]) for picture in pictures.values()}
+    if len(sizes) > 1:
+        raise InputError(
+            f"expected pictures of one size, got {', '.join(f'{w} x {h}' for w, h in sorted(sizes))} in {folder}"
+        )
+    return pictures, sizes.pop()
 
 
 def read_grey(path: Path) -> UInt8[np.ndarray, "height width"]:
@@ -132,7 +136,7 @@ def _fit(
     try:
         if model == "fisheye":
             names = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # before OpenCV 5, and since
-            flags = names.CALIB_RECOMPUTE_EXTRINSIC | names.CALIB_FIX_SKEW
+            flags = sum(getattr(names, name) for name in ("CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW"))
             points = [each.astype(np.float64) for each in points]
             seen = [each.astype(np.float64) for each in seen]
             error, K, D, _, _ = cv2.fisheye.calibrate(points, seen, size, np.eye(3), np.zeros((4, 1)), flags=flags)

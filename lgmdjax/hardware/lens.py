@@ -82,7 +82,7 @@ def _fisheye(
     bent = theta * (1 + sum(k * theta ** (2 * n + 2) for n, k in enumerate(D)))
     scale = bent / np.maximum(across, 1e-12)
     grid = np.linspace(0, np.pi, 2000)
-    slope = 1 + sum((2 * n + 3) * k * grid ** (2 * n + 2) for n, k in enumerate(D))
+    slope = 1 + np.sum([(2 * n + 3) * k * grid ** (2 * n + 2) for n, k in enumerate(D)], axis=0)
     return np.stack([scale * x, scale * y]), theta < _first_fall(grid, slope)
 
 

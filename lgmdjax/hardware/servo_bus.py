@@ -10,14 +10,15 @@ import termios
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.hardware import ax_servo
 from lgmdjax.hardware.ax_servo import Address, Fault
 from lgmdjax.hardware.clock import Clock
 
-if HAS_SDK := find_spec("dynamixel_sdk") is not None and find_spec("serial") is not None:
+HAS_SDK = find_spec("dynamixel_sdk") is not None and find_spec("serial") is not None
+if TYPE_CHECKING or HAS_SDK:
     from dynamixel_sdk import COMM_SUCCESS, GroupSyncWrite, PortHandler, Protocol1PacketHandler
     from serial import SerialException
 else:  # so that the class below can be defined
@@ -28,7 +29,7 @@ Result = TypeVar("Result")
 STATUS_LENGTH = 8  # bytes: position, speed, load, voltage, temperature
 ANSWER_TIMEOUT = 0.012  # s; a USB adapter may hold back an answer for some milliseconds
 MAX_FAILURES = 4  # of a servo in a row
-CONNECT_ATTEMPTS, RELEASE_ATTEMPTS = 3, 6
+CONNECT_ATTEMPTS, RELEASE_ATTEMPTS = 10, 6  # a start may take its time
 STOPPING = Fault.OVERHEATING | Fault.OVERLOAD | Fault.VOLTAGE  # what a servo says beside its answer
 
 
@@ -195,6 +196,8 @@ class _Port(PortHandler):
         self.setPacketTimeoutMillis(1000.0 * ANSWER_TIMEOUT + self.tx_time_per_byte * packet_length)
 
     def readPort(self, length: int) -> bytes:
+        if self.ser is None:
+            raise OSError("the port was never opened")
         remaining = self.packet_timeout - self.getTimeSinceStart()
         select.select([self.ser.fileno()], [], [], self._clock.to_wall(remaining / 1000.0))
         return self.ser.read(length)

@@ -26,6 +26,7 @@ from typing import TextIO
 import av
 import jax
 import numpy as np
+from av.container import OutputContainer
 from av.error import FFmpegError
 from jaxtyping import UInt8
 
@@ -99,7 +100,7 @@ class PictureServer:
         self._listener = socket.create_server(("127.0.0.1", port))
         self._listener.setblocking(False)
         self.address = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
-        self._clients: list[tuple[socket.socket, av.container.OutputContainer, av.VideoStream]] = []
+        self._clients: list[tuple[socket.socket, OutputContainer, av.VideoStream]] = []
 
     def send(self, picture: UInt8[np.ndarray, "height width"]) -> None:
         """Send a picture to all clients."""
@@ -198,8 +199,12 @@ class SimulatedRobot:
         """Serve for some seconds; obey the names of faults that come as lines from an open file, to its end."""
         self._lag = self.clock.now()
         while self.time < seconds:
-            self._advance()
-            self._serve(None if self._at_end else commands)
+            self.turn(None if self._at_end else commands)
+
+    def turn(self, commands: int | None = None) -> None:
+        """Catch up with the clock, send what is due, and wait for bytes or for the next step; arguments as of `run`."""
+        self._advance()
+        self._serve(commands)
 
     def close(self) -> None:
         """Close ports and files."""

@@ -9,7 +9,7 @@ voltage and load; after the errors that its table names under `SHUTDOWN` it lets
 Source: maker's e-manual of Protocol 1.0 and of the AX-12A. Nothing here comes from the SDK that drives the servos.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,7 @@ FACTORY = {  # what is not zero in the table of a new AX-12A
     **{Address.ALARM_LED: 36, Address.SHUTDOWN: 36, 26: 1, 27: 1, 28: 32, 29: 32, Address.TORQUE_LIMIT: 1023},
     **{Address.PRESENT_POSITION: 512, Address.PRESENT_VOLTAGE: 111, Address.PRESENT_TEMPERATURE: 36, Address.PUNCH: 32},
 }
-LARGEST = {  # entries that have a range of their own
+LARGEST: Mapping[int, int] = {  # entries that have a range of their own
     **dict.fromkeys((Address.LOWEST_POSITION, Address.HIGHEST_POSITION, Address.GOAL_POSITION), 1023),
     **dict.fromkeys((Address.MOVING_SPEED, Address.TORQUE_LIMIT, Address.MAX_TORQUE, Address.PUNCH), 1023),
     **dict.fromkeys((Address.TORQUE_ENABLE, Address.LED, Address.LOCK), 1),

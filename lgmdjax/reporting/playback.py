@@ -108,6 +108,16 @@ def cut(playback: Playback, frames: int) -> Playback:
     return playback._replace(**{name: rows if rows is None else rows[:frames] for name, rows in series.items()})
 
 
+def with_senses(playback: Playback, first: int, pictures: ndarray, layers: ndarray) -> Playback:
+    """Return a walk with what was sensed in its frames from `first` on; arrays that it has are written into."""
+    series: dict[str, ndarray] = {}
+    for name, part in (("pictures", pictures), ("layers", layers)):
+        known = getattr(playback, name)
+        series[name] = np.zeros((len(playback.time), *part.shape[1:]), np.uint8) if known is None else known
+        series[name][first : first + len(part)] = part
+    return playback._replace(**series)
+
+
 def path_of(playback: Playback) -> list[Float[ndarray, "frames 3"]]:
     """Return the positions [m] between a start or reset and the next, one array for each."""
     starts = np.flatnonzero(playback.is_first)
@@ -140,7 +150,7 @@ def _encode(pictures: UInt8[ndarray, "frames 2 height width"]) -> UInt8[ndarray,
 
 
 def _decode(content: bytes, frames: int) -> UInt8[ndarray, "frames 2 height width"]:
-    with av.open(io.BytesIO(content)) as container:
+    with av.open(io.BytesIO(content), "r") as container:
         decoded = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
     if len(decoded) != frames:
         raise ValueError(f"{len(decoded)} pictures of {frames} frames")

@@ -17,7 +17,7 @@ from lgmdjax.reporting.playback import FRAME_RATE, Playback
 from lgmdjax.reporting.room_shape import centres_during, shape_of
 from lgmdjax.reporting.walk_scene import HAS_VISER as HAS_VISER
 from lgmdjax.reporting.walk_scene import WalkScene
-from lgmdjax.runtime.storage import replacing
+from lgmdjax.runtime.partial_files import replacing
 from lgmdjax.simulation.closed_loop import Record, Room
 from lgmdjax.world.arena import Arena
 

@@ -174,7 +174,6 @@ def _check(trace: WalkTrace) -> None:
 
 def _views(trace: WalkTrace, room: arena.Arena, rows: Int[ndarray, " n"]) -> tuple[_Views, RobotCapsules]:
     """Compute the poses of cameras, eyes and limbs in the chosen frames, and their rooms."""
-    to_single = partial(jnp.asarray, dtype=jnp.float32)
     position, heading = _smooth(trace)
     forward = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)[rows]
     target = position[rows]

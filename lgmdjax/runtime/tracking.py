@@ -16,9 +16,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 
-Log = Callable[[int, Mapping[str, float]], None]
+Log = Callable[[int, Mapping[str, float]], object]
 """`log(step, values)`: takes values of one step of a fit, which is an epoch, an update or a window."""
-
 
 _listeners: ContextVar[tuple[Log, ...]] = ContextVar("listeners", default=())
 

@@ -1,6 +1,5 @@
 """Robots assembled from the files of a run, or from those of the package."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -52,7 +51,7 @@ def camera_settings(robot: closed_loop.Params) -> CameraSettings:
     return CameraSettings(**of_camera, pooling=robot.controller.lgmd.pooling, falloff=robot.controller.lgmd.falloff)
 
 
-def read_camera_settings(header: Mapping[str, JsonObject]) -> CameraSettings:
+def read_camera_settings(header: JsonObject) -> CameraSettings:
     """Return the camera of a controller's training, or of recorded walks, from their header."""
     eyes = header["eyes"]
     schema.check(EYES, eyes, "header: eyes", "collect and train again")

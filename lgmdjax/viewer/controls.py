@@ -38,8 +38,7 @@ class Transport:
         self.folder = server.gui.add_folder("Recorded walk")
         with self.folder:
             self._title = server.gui.add_markdown("")
-            walks: Sequence[str] = ("0",)
-            self._walk = server.gui.add_dropdown("Walk", walks, visible=False)
+            self._walk: viser.GuiDropdownHandle[str] = server.gui.add_dropdown("Walk", [str(0)], visible=False)
             self._play = server.gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             step = server.gui.add_button_group("Step", ("-1 s", "-1 frame", "+1 frame", "+1 s"))
             speed = server.gui.add_dropdown("Speed", SPEEDS, initial_value="1")

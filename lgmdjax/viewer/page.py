@@ -255,16 +255,8 @@ class Viewer:
         playback = self.playback
         if playback is None or self.is_live:
             return
-        if report.first == 0 or playback.pictures is None or playback.layers is None:
-            frames = len(playback.time)
-            playback = playback._replace(
-                pictures=np.zeros((frames, *report.pictures.shape[1:]), np.uint8),
-                layers=np.zeros((frames, *report.layers.shape[1:]), np.uint8),
-            )
+        self.playback = playbacks.with_senses(playback, report.first, report.pictures, report.layers)
         self.sensed = report.first + len(report.pictures)
-        for whole, part in ((playback.pictures, report.pictures), (playback.layers, report.layers)):
-            whole[report.first : self.sensed] = part  # type: ignore[index]
-        self.playback = playback
 
     def _enter(self, entered: Entered) -> None:
         self.is_live, self.contacts, self.keeps = True, 0, False

@@ -9,33 +9,25 @@
 Every frame has the joint angles, so legs are drawn as they were. Pictures are not recorded: they are rendered again, as
 the robot's camera sees the room, and the LGMDs run on them again.
 
-| header has  | walks of                        | rooms                                                  |
-| ----------- | ------------------------------- | ------------------------------------------------------ |
-| trial       | `lgmdjax trial`, stage evaluate | `trials.sample_rooms`                                  |
-| benchmark   | studies                         | `room_batches.benchmark_rooms`                         |
-| teacher     | stage collect                   | `room_batches.training_rooms`                          |
-| live        | the viewer                      | in the header (`lgmdjax.viewer.edits`)                 |
+The header of the walks tells how their rooms were made (`lgmdjax.datasets.recorded_rooms`); that of a walk of the
+live simulation has its room and every move of an obstacle (`lgmdjax.viewer.edits`).
 """
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgmdjax.errors import InputError
-from lgmdjax.evaluation import trials
+from lgmdjax.datasets import recorded_rooms
 from lgmdjax.reporting import selection
 from lgmdjax.reporting.playback import Playback
 from lgmdjax.reporting.room_shape import centres_during
 from lgmdjax.reporting.walk_page import to_playback
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.sensors.settings import CameraSettings
-from lgmdjax.simulation import assembly, closed_loop, episodes, room_batches
+from lgmdjax.simulation import assembly, closed_loop, episodes
 from lgmdjax.simulation.episodes import Walk
-from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.viewer import edits, live_step
 from lgmdjax.viewer.messages import Open, Report, Senses, Status, Walks
 from lgmdjax.viewer.walk_paths import find_walks
@@ -51,11 +43,12 @@ class WalkSource:
     def __init__(self, command: Open, report: Callable[[Report], None]):
         report(Status(f"reading {command.path}"))
         folder, names = find_walks(command.path)
-        self.walks_read = [walk for walk in episodes.read(folder) if names is None or walk.episode in names]
+        recorded = episodes.read(folder)
+        self.walks_read = [walk for walk in recorded if names is None or walk.episode in names]
         self.parameters, self.folder, self.report = episodes.read_parameters(folder), folder, report
         self.robot = robot_of(folder)
         self.index = select(self.walks_read) if command.walk is None else command.walk
-        self.room, self.centres = room_of(self.parameters, self.walk, len(self.walks_read), folder)
+        self.room, self.centres = room_of(self.parameters, self.walk, len(recorded), folder)
         self.done, self.state = 0, live_step.start_replay(self.robot)
 
     @property
@@ -125,7 +118,7 @@ def _as_live(robot: closed_loop.Params) -> closed_loop.Params:
     return replace(robot, controller=replace(robot.controller, policy=()))
 
 
-def room_of(parameters: JsonObject, walk: Walk, walks: int, folder: Path) -> tuple[Arena, np.ndarray]:
+def room_of(parameters: JsonObject, walk: Walk, recorded: int, folder: Path) -> tuple[Arena, np.ndarray]:
     """Return the room of a walk, and where its obstacles were in every frame (a single row if they stood still).
 
     Raises InputError for walks of a kind whose rooms cannot be built again.
@@ -133,31 +126,8 @@ def room_of(parameters: JsonObject, walk: Walk, walks: int, folder: Path) -> tup
     live = parameters.get("live")
     if isinstance(live, dict):
         return edits.read_edits(live, len(walk), folder)
-    room = jax.tree.map(lambda leaf: leaf[0], _rooms(parameters, walk, folder))
+    room = recorded_rooms.find_rooms(parameters, [walk], recorded, folder)[0]
     return room, centres_during(room, np.asarray(walk.time))
-
-
-def _rooms(parameters: JsonObject, walk: Walk, folder: Path) -> Arena:
-    """Return a batch with the room of a walk alone."""
-    try:
-        if "trial" in parameters:
-            rooms, row = trials.sample_rooms(parameters["trial"], int(parameters["seeds"]), walk.seed), walk.room
-        elif "benchmark" in parameters:
-            fields = dict(parameters["benchmark"])
-            benchmark = BenchmarkRooms(**{**fields, "eyes": CameraSettings(**fields["eyes"])})
-            rooms = room_batches.benchmark_rooms(benchmark, walk.seed, parameters.get("contrast", 1.0))
-            row = walk.room
-        elif "teacher" in parameters:
-            robots = int(parameters["robots"])
-            rooms, row = room_batches.training_rooms(walk.seed, walk.room // robots, robots), walk.room % robots
-        else:
-            raise KeyError("trial")
-        return jax.tree.map(lambda leaf: leaf[row : row + 1], rooms.arena)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{folder}: expected walks of a trial, a study, stage collect or the viewer, got {', '.join(parameters)}; "
-            "their rooms are not known"
-        ) from error
 
 
 def _describe(walk: Walk) -> str:

@@ -17,8 +17,8 @@ WIDTH = 220  # px of the picture
 MARGIN = 0.04  # of the longer side
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 WALL, OBSTACLE, RED = "#222222", "#c9c5bd", "#c1121f"
-Path = Float[ndarray, "points _"]
-"""Points of a path [m], x and y first."""
+Path = Float[ndarray, "_ _"]
+"""Points of a path [m], one a row, x and y first."""
 
 
 @runtime_checkable

@@ -4,7 +4,7 @@ import struct
 from pathlib import Path
 
 import pytest
-from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]  # protobuf makes it on import
 
 from lgmdjax.cli import main, tracking
 from lgmdjax.errors import InputError

@@ -17,7 +17,6 @@ import synthetic
 
 from lgmdjax.cli import main
 from lgmdjax.datasets import card, exporter, pictures, recorded, statistics
-from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.sensors import hemifield
 from lgmdjax.sensors.settings import CameraSettings
@@ -52,7 +51,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         record = walk_of(ROBOTS, FRAMES)
         record = replace(record, position=record.position + np.asarray([[0, 0, 0.1]], np.float32))
         seen = rerender.render_walks(assembly.camera_params(EYES), rooms, record)
-        detector = assembly.fit_detector(lgmd.Params(**DETECTOR), EYES)
+        detector = assembly.fit_detector(assembly.lgmd_params(DETECTOR), EYES)
         u = [pictures.respond(detector, *pair) for pair in zip(seen, record.is_first, strict=True)]
     writer = episodes.Writer(folder / "collect" / "episodes", PARAMETERS)
     writer.write(replace(record, u=np.stack(u)), episode=0, rooms=[0, 1], seed=SEED)

@@ -91,7 +91,7 @@ def test_eyes_are_fixed_to_the_trunk(walk: walk_video.WalkTrace):
 
 
 def test_the_robot_is_always_in_its_window_of_the_image(walk: walk_video.WalkTrace):
-    views, robot = walk_video._views(walk, np.arange(0, 300, 10))
+    views, robot = walk_video._views(walk, synthetic.room(), np.arange(0, 300, 10))
     params = third_person.Params()
     ends = jnp.concatenate([views.starts, views.ends], 1)
     for position, rotation, points in zip(views.camera_position, views.camera_rotation, ends, strict=True):

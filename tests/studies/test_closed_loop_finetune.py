@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -166,6 +167,7 @@ def test_all_learners_train_for_the_same_time_and_have_a_row(finetuned, tmp_path
     assert (folder / "closed_loop_finetune.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_every_window_of_a_fit_is_logged(params, monkeypatch):
     """Two rooms of three windows, whose gradient is a stand-in."""
     found = rollout_gradient.Gradient(
@@ -176,9 +178,10 @@ def test_every_window_of_a_fit_is_logged(params, monkeypatch):
     gradient = lambda *_, **__: (found, None, synthetic.walk(2, 3))  # noqa: E731
     monkeypatch.setattr(rollout_gradient, "gradient", gradient)
     robot, logged = replace(assembly.load_robot(), controller=params), []
+    unused: Any = (None, lambda _: None)  # the model and the rooms
     settings = finetuning.Settings(rooms=2, windows_per_room=3)
     with tracking.listening(lambda step, values: logged.append((step, values["joint/loss"], values["joint/noise"]))):
-        finetuning.finetune(robot, None, lambda _: None, rollout_gradient.Settings(), settings, label="joint")
+        finetuning.finetune(robot, *unused, rollout_gradient.Settings(), settings, label="joint")
     assert logged == [(window, 0.25, 0.5) for window in range(1, 7)]
 
 
