@@ -9,6 +9,7 @@ row.
 
 from functools import cache
 
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Float
@@ -46,7 +47,7 @@ def row() -> Float[np.ndarray, "postures 6 3"]:
     down = np.array([0.0, 0.0, SITTING_HEIGHT + feet[0, 2]])  # from standing to sitting, of the trunk
     progress = np.linspace(1.0, 0.0, POSTURES)[:, None, None]  # 1 sitting, 0 standing
     lowered = feet + progress * (SITTING_REACH * outward - down)
-    postures = np.array(kinematics.inverse(geometry, lowered), float)
+    postures = np.array(kinematics.inverse(geometry, jnp.asarray(lowered)), float)
     postures[-1] = hexapod.stance()
     return postures
 

@@ -29,7 +29,7 @@ Result = TypeVar("Result")
 STATUS_LENGTH = 8  # bytes: position, speed, load, voltage, temperature
 ANSWER_TIMEOUT = 0.012  # s; a USB adapter may hold back an answer for some milliseconds
 MAX_FAILURES = 4  # of a servo in a row
-CONNECT_ATTEMPTS, RELEASE_ATTEMPTS = 3, 6
+CONNECT_ATTEMPTS, RELEASE_ATTEMPTS = 10, 6  # a start may take its time
 STOPPING = Fault.OVERHEATING | Fault.OVERLOAD | Fault.VOLTAGE  # what a servo says beside its answer
 
 

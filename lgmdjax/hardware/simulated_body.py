@@ -8,6 +8,7 @@ adds nothing, and the friction of its gears is left.
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
@@ -63,12 +64,13 @@ class Body:
 
     def pose(self) -> hexapod.Pose:
         """Return the trunk's pose."""
-        return hexapod.Pose(position=self.data.qpos[:3].copy(), quaternion=self.data.qpos[3:7].copy())
+        return hexapod.Pose(position=jnp.array(self.data.qpos[:3]), quaternion=jnp.array(self.data.qpos[3:7]))  # copies
 
     def acceleration(self) -> Float[np.ndarray, "3"]:
         """Return what an accelerometer in the trunk measures at rest [m/s2], in the trunk's frame."""
-        matrix = np.asarray(hexapod.rotation(self.pose()))
-        return matrix.T @ -self.model.opt.gravity
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, self.data.qpos[3:7])
+        return matrix.reshape(3, 3).T @ -self.model.opt.gravity
 
     def torques(self) -> Bool[np.ndarray, "18"]:
         """Return which servos have torque."""
@@ -144,7 +146,7 @@ def _compile(room: arena.Arena) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _add_prisms(spec: mujoco.MjSpec, prisms: Prisms, shape: int) -> None:
+def _add_prisms(spec: mujoco.MjSpec, prisms: Prisms, shape: mujoco.mjtGeom) -> None:
     for row in np.flatnonzero(np.asarray(prisms.top) > 0):
         (x, y), (a, b) = np.asarray(prisms.centre[row], float), np.asarray(prisms.half_size[row], float)
         bottom, top, yaw = (float(values[row]) for values in (prisms.bottom, prisms.top, prisms.yaw))

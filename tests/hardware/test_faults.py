@@ -25,12 +25,13 @@ from lgmdjax.hardware.simulated_body import Body
 from lgmdjax.hardware.simulated_robot import PictureServer, Renderer, SimulatedRobot, Terminal
 from lgmdjax.hardware.simulated_servos import Bank
 from lgmdjax.hardware.supervisor import Mode, Reason
+from lgmdjax.sensors import camera
 from lgmdjax.world import scenes
 from lgmdjax.world.arena import Arena
 
 SEATED, STANDING = 0.04, 0.085  # m, of the trunk's centre: below, above
 LONGEST = 15.0  # s of a drive
-TICK = 0.001  # s
+TICK = 0.002  # s
 
 
 class WaitingTime(Clock):
@@ -102,12 +103,14 @@ Bench = tuple[Brain, Arena, Renderer]
 
 
 @pytest.fixture(scope="module")
-def compiled() -> Iterator[Bench]:
+def compiled() -> Bench:
     """What has to be compiled, once for all robots."""
     with jax.enable_x64(False):
         params = exporter.load(None)
         room = jax.jit(scenes.testing_room)(jax.random.key(0))
-        yield Brain(params), room, PromptRenderer(room, params.camera)
+        whole = camera.Params(width=params.camera.width, height=params.camera.height)  # as a real camera's pictures are
+        made = Brain(params), room, PromptRenderer(room, whole)
+    return made
 
 
 class Drive:
