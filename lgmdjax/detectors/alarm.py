@@ -23,7 +23,8 @@ of ln(<e>_fast / <e>_slow). It is 1/2 where nothing has moved yet. Four points:
 - Running means begin with what they see first (they are divided by the weight that they have gathered), so scenery that
   moves from the first frame on is no rise.
 - Frames in which nothing changes, as in a repeated frame or before a stimulus begins, are left out of all means: the
-  scale of motion is known only once something moves.
+  scale of motion is known only once something moves. So A stays as it is while a picture stands still, and an alarm
+  lasts until something moves again.
 - A change of light changes all of the field alike, so feed-forward inhibition w by the median takes it away; an object
   moves the median only when it covers half of the field.
 - Division by a running mean is the gain control of photoreceptors and of normalisation models (Heeger 1992). The median
