@@ -178,11 +178,10 @@ def test_every_window_of_a_fit_is_logged(params, monkeypatch):
     gradient = lambda *_, **__: (found, None, synthetic.walk(2, 3))  # noqa: E731
     monkeypatch.setattr(rollout_gradient, "gradient", gradient)
     robot, logged = replace(assembly.load_robot(), controller=params), []
-    model: Any = None  # neither is used by the stand-ins
-    rooms: Any = lambda _: None
+    unused: Any = None  # model and rooms, which the stand-ins ignore
     settings = finetuning.Settings(rooms=2, windows_per_room=3)
     with tracking.listening(lambda step, values: logged.append((step, values["joint/loss"], values["joint/noise"]))):
-        finetuning.finetune(robot, model, rooms, rollout_gradient.Settings(), settings, label="joint")
+        finetuning.finetune(robot, unused, lambda _: unused, rollout_gradient.Settings(), settings, label="joint")
     assert logged == [(window, 0.25, 0.5) for window in range(1, 7)]
 
 
