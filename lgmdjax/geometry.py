@@ -42,7 +42,7 @@ def yaw(quaternion: Float[np.ndarray, "*n 4"]) -> Float[np.ndarray, "*n"]:
     array([1.5708])
     """
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def rotate(vector: Float[Array, "*#shape 2"], angle: Float[Array, "*#shape"]) -> Float[Array, "*shape 2"]:

@@ -229,7 +229,7 @@ def test_wrong_requests_are_one_line(run: Path, tmp_path: Path, capsys: pytest.C
     ):
         assert main.main(["export-dataset", *arguments]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("lgmdjax: expected ") and words in line
+        assert line.startswith("lgmdjax: ") and "expected " in line and words in line
     assert not Path(out).exists()
     assert main.main(["export-dataset", str(run), out, "--format", "parquet"]) == 0
     assert capsys.readouterr().out.split() == [f"{out}/README.md", f"{out}/walks.parquet"]

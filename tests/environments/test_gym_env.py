@@ -202,7 +202,7 @@ def test_spaces_have_the_documented_bounds(robot):
     pixels = functional.make(observation="pixels", **one)
     assert gym_env.observation_space(laser).high.tolist() == [5.0] * 341
     np.testing.assert_allclose(gym_env.action_space(laser).high[:3], np.deg2rad([75, 100, 67]), rtol=1e-6)
-    assert gym_env.observation_space(pixels) == gymnasium.spaces.Box(0, 255, (2, 24, 16), np.uint8)
+    assert gym_env.observation_space(pixels) == gymnasium.spaces.Box(0, 255, (2, 24, 32), np.uint8)
     assert gym_env.action_space(pixels) == gymnasium.spaces.Box(-1.0, 2.0, (2,), np.float32)
     for environment in (laser, pixels):
         seen, _ = jax.eval_shape(environment.reset, jax.random.key(0))
