@@ -25,7 +25,8 @@ from lgmdjax.errors import InputError
 from lgmdjax.evaluation import clip_labels, clip_responses, clip_scores, stimulus_scores
 from lgmdjax.evaluation.clip_labels import Label
 from lgmdjax.evaluation.clip_responses import Clip, Trace
-from lgmdjax.reporting import clip_page
+from lgmdjax.paths import PACKAGE_DIR
+from lgmdjax.reporting import pages
 from lgmdjax.reporting.figures import clip_scores as figure
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import partial_files, storage, versions
@@ -160,7 +161,8 @@ def _page(clips: Sequence[Clip], rows: Sequence[JsonObject], traces: Traces) -> 
     labels = [clip.label for clip in clips]
     found = versions.installed()
     drawings = [_draw(k, clip, rows, traces) for k, clip in enumerate(clips)]
-    return clip_page.render_page(
+    template = pages.environment(PACKAGE_DIR / "reporting" / "templates").get_template("clips.html.j2")
+    return template.render(
         {
             "labels": labels,
             "approaches": sum(label.is_approach for label in labels),
@@ -170,8 +172,8 @@ def _page(clips: Sequence[Clip], rows: Sequence[JsonObject], traces: Traces) -> 
             "window": clip_scores.WINDOW,
             "tolerance": clip_scores.PEAK_TOLERANCE,
             "rows": rows,
-            "roc": clip_page.inline_png(style.to_png(figure.plot_roc(rows))),
-            "traces": [clip_page.inline_png(drawing) for drawing in drawings],
+            "roc": pages.inline("image/png", style.to_png(figure.plot_roc(rows))),
+            "traces": [pages.inline("image/png", drawing) for drawing in drawings],
             "version": found["lgmdjax"],
             "jax_version": found["jax"],
         }

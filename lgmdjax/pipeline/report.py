@@ -15,7 +15,6 @@ so that it works offline. A page is written whole or not at all.
 | how made      | run.json, the done.json of each stage                                       |
 """
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,7 +29,7 @@ from lgmdjax.paths import PACKAGE_DIR
 from lgmdjax.pipeline import report_data, report_figures
 from lgmdjax.pipeline.report_figures import NOMINAL_SPEED, TITLES, VARIANTS
 from lgmdjax.pipeline.settings import ReportSettings
-from lgmdjax.reporting import walk_page, walk_video
+from lgmdjax.reporting import pages, walk_page, walk_video
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import partial_files
 from lgmdjax.runtime.storage import JsonObject, read_arrays, read_file
@@ -39,7 +38,6 @@ from lgmdjax.studies import supervision, velocity
 from lgmdjax.world import arena, scenes
 
 WALK_PAGE, WALK_SECONDS = "walk.html", 30.0  # beside index.html, and how much of the walk it shows
-MINUS = "\N{MINUS SIGN}"
 INPUTS = {  # of the policies
     "teacher": "laser scanner",
     "learned": "both LGMDs",
@@ -76,7 +74,9 @@ def render(
     """
     room = scenes.testing_room() if room is None else room
     out = run_folder / "report" if out is None else out
-    page = _environment().get_template("report.html.j2")
+    environment = pages.environment(PACKAGE_DIR / "pipeline" / "templates")
+    environment.filters["number"] = _number
+    page = environment.get_template("report.html.j2")
     walk_link = WALK_PAGE if (out / WALK_PAGE).is_file() else None
     try:
         text = page.render(**_contents(run_folder, room, video_seconds), walk_page=walk_link)
@@ -99,7 +99,7 @@ def _contents(run_folder: Path, room: arena.Arena, video_seconds: float) -> Json
     return {
         **results._asdict(),
         "figures": _figures(run_folder, results, onset, room),
-        "video": _inline("video/mp4", report_figures.render_video(run_folder, camera_params, room, video_seconds)),
+        "video": pages.inline("video/mp4", report_figures.render_video(run_folder, camera_params, room, video_seconds)),
         "camera_params": camera_params,
         "layers_size": list(reversed(layers["picture"].shape)),
         "rounds": results.settings["train"].get("dagger_rounds", 0),
@@ -126,7 +126,7 @@ def _figures(
     }
     pictures = {name: style.to_svg(figure) for name, figure in figures.items()}
     pictures |= {trial: read_file(run_folder / f"evaluate/{trial}.svg") for trial in results.outcomes}
-    return {name: _inline("image/svg+xml", picture) for name, picture in pictures.items()}
+    return {name: pages.inline("image/svg+xml", picture) for name, picture in pictures.items()}
 
 
 def _study_contents(studies: Mapping[str, Sequence[JsonObject]]) -> JsonObject:
@@ -159,18 +159,6 @@ def _robot_size() -> dict[str, float]:
     return {"length": float(length), "width": float(width)}
 
 
-def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(PACKAGE_DIR / "pipeline" / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"number": _number, "fixed": _fixed}
-    return environment
-
-
 def _number(value: float, digits: int = 3) -> str:
     """Format a number with some significant digits, without trailing zeros; a dash if it is not finite.
 
@@ -179,15 +167,4 @@ def _number(value: float, digits: int = 3) -> str:
     """
     if value is None or not math.isfinite(value):
         return "–"
-    return np.format_float_positional(value, precision=digits, fractional=False, trim="-").replace("-", MINUS)
-
-
-def _fixed(value: float, decimals: int) -> str:
-    """Format a number with some decimals; a dash if it is not finite."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", MINUS)  # + 0.0 turns -0 into 0
-
-
-def _inline(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+    return np.format_float_positional(value, precision=digits, fractional=False, trim="-").replace("-", pages.MINUS)

@@ -1,7 +1,7 @@
-from . import clip_page as clip_page
 from . import figures as figures
 from . import inline_video as inline_video
 from . import lgmd_overlay as lgmd_overlay
+from . import pages as pages
 from . import playback as playback
 from . import room_shape as room_shape
 from . import selection as selection

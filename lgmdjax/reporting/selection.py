@@ -7,14 +7,37 @@ something has both.
 Works on host arrays.
 """
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
+from lgmdjax.errors import InputError
+from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
+from lgmdjax.world.arena import Arena
 
 STRETCH = 10.0  # s, by which walks are compared
 _EVERY = 15  # frames between two stretches that are compared
+
+
+def choose_walk(record: Record, room: Room | Arena, index: int | None = None) -> tuple[Record, Arena]:
+    """Return one walk of a record, axis (frame,), and its room; that of `select_walk` if no index is given.
+
+    Args:
+        record: of one robot or of several.
+        room: of all robots, or a batch with one for each.
+        index: of the robot; negative ones count from the end.
+
+    Raises InputError if there is no such robot.
+    """
+    batch = jax.tree.map(np.asarray, record if np.ndim(record.time) == 2 else jax.tree.map(lambda x: x[None], record))
+    index = select_walk(batch) if index is None else index
+    if not -len(batch.time) <= index < len(batch.time):
+        raise InputError(f"expected an index of one of {len(batch.time)} walks, got {index}; choose another")
+    scene = room.arena if isinstance(room, Room) else room
+    if np.ndim(scene.bounds) == 2:
+        scene = jax.tree.map(lambda leaf: leaf[index], scene)
+    return jax.tree.map(lambda leaf: leaf[index], batch), scene
 
 
 def select_walk(record: Record) -> int:

@@ -67,17 +67,10 @@ def walk_page(
     lj.walk_page(record, rooms)  # the last line of a notebook's cell: the walk in 3D
     ```
     """
-    batch = jax.tree.map(np.asarray, record if np.ndim(record.time) == 2 else jax.tree.map(lambda x: x[None], record))
-    index = selection.select_walk(batch) if index is None else index
-    if not -len(batch.time) <= index < len(batch.time):
-        raise InputError(f"expected an index of one of {len(batch.time)} walks, got {index}; choose another")
-    scene = room.arena if isinstance(room, Room) else room
-    if np.ndim(scene.bounds) == 2:
-        scene = jax.tree.map(lambda leaf: leaf[index], scene)
-    walk = jax.tree.map(lambda leaf: leaf[index], batch)
+    walk, scene = selection.choose_walk(record, room, index)
     if not 0 < seconds <= MAX_SECONDS:
         raise InputError(f"expected seconds of more than 0 to {MAX_SECONDS:g}, got {seconds}; choose a shorter part")
-    frames = selection.select_segment(walk.position, walk.velocity, round(seconds * FRAME_RATE))
+    frames = selection.select_segment(np.asarray(walk.position), np.asarray(walk.velocity), round(seconds * FRAME_RATE))
     part = jax.tree.map(lambda leaf: leaf[frames], walk)
     return page_of(to_playback(part, scene), follow=follow)
 

@@ -127,14 +127,8 @@ def choose_trace(
     record: Record, room: Room | arena.Arena, robot: closed_loop.Params | None = None, index: int | None = None
 ) -> tuple[WalkTrace, arena.Arena, camera.Params]:
     """Return the walk that `write_video` shows, its room, and the camera of the eyes; arguments as there."""
-    batch = jax.tree.map(np.asarray, record if np.ndim(record.time) == 2 else jax.tree.map(lambda x: x[None], record))
-    index = selection.select_walk(batch) if index is None else index
-    if not -len(batch.time) <= index < len(batch.time):
-        raise InputError(f"expected an index of one of {len(batch.time)} walks, got {index}; choose another")
-    scene = room.arena if isinstance(room, Room) else room
-    if np.ndim(scene.bounds) == 2:
-        scene = jax.tree.map(lambda leaf: leaf[index], scene)
-    trace = WalkTrace(*(getattr(batch, name)[index] for name in WalkTrace._fields))
+    walk, scene = selection.choose_walk(record, room, index)
+    trace = WalkTrace(*(getattr(walk, name) for name in WalkTrace._fields))
     return trace, scene, (robot or assembly.load_robot()).camera
 
 
