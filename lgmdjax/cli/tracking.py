@@ -4,10 +4,9 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from pkgutil import resolve_name
 
 from lgmdjax.errors import InputError, one_line
-from lgmdjax.runtime import tracking
+from lgmdjax.runtime import tracking, user_objects
 
 TENSORBOARD = "tensorboard"
 FOLDER = "tensorboard"  # in the run folder
@@ -50,12 +49,7 @@ def following(track: str, run: Path) -> Iterator[None]:
 
 def _find(track: str) -> tracking.Log:
     expected = f"expected --track {TENSORBOARD}, or module:function of a function log(step, values)"
-    if ":" not in track:
-        raise InputError(f"{expected}, got {track}; choose one")
-    try:
-        log = resolve_name(track)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"{expected}, got {track} ({one_line(error)}); is its folder on PYTHONPATH?") from error
+    log = user_objects.find(track, expected)
     if not callable(log):
         raise InputError(f"{expected}, got {track}, which can't be called; name the function")
     return log

@@ -16,7 +16,6 @@ A detector of a fixed delay delta and angular threshold theta_t has slope 1 / ta
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import jax
@@ -43,6 +42,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.evaluation import stimulus_clips
 from lgmdjax.evaluation.settings import StimulusBench
 from lgmdjax.evaluation.stimulus_clips import CONTRASTS, NOISE, Clips
+from lgmdjax.runtime import user_objects
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import camera
 
@@ -102,12 +102,7 @@ def find(name: str) -> DetectorSetup:
     if name in DETECTORS:
         return DETECTORS[name]
     expected = f"expected a detector among {', '.join(DETECTORS)}, or module:attribute"
-    if ":" not in name:
-        raise InputError(f"{expected}, got {name}; choose one")
-    try:
-        detector = resolve_name(name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"{expected}, got {name} ({error}); is its folder on PYTHONPATH?") from error
+    detector = user_objects.find(name, expected)
     missing = [part for part in ("Params", "init", "step") if not hasattr(detector, part)]
     if missing:
         raise InputError(f"{expected}, got {name} without {', '.join(missing)}; see protocol.Detector")

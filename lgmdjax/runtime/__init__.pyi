@@ -12,4 +12,5 @@ from . import schema as schema
 from . import static_arguments as static_arguments
 from . import storage as storage
 from . import tracking as tracking
+from . import user_objects as user_objects
 from . import versions as versions
