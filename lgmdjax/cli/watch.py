@@ -97,8 +97,6 @@ def _settings(flags: WatchFlags) -> tuple[StereoLayout, Detectors]:
         stereo=flags.stereo is not None, overlap=flags.overlap, ground=flags.ground, width=flags.width
     )
     raised = alarm.Params(threshold=flags.alarm.threshold, persistence=flags.alarm.persistence)
-    lgmd.check(params)
-    alarm.check(raised)
     return layout, Detectors(params, raised)
 
 

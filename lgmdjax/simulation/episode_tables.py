@@ -34,34 +34,31 @@ class Field:
         return (6, 3) if len(self.columns) == 18 else (len(self.columns),) if len(self.columns) > 1 else ()
 
 
+def _both(name: str) -> tuple[str, ...]:
+    """Return the names of the columns of both sides."""
+    return tuple(f"{name}_{side}" for side in hemifield.SIDES)
+
+
 FIELDS: Mapping[str, Field] = {
     "time": Field(("time",), "s", meaning="since the start of the walk"),
     "position": Field(("x", "y", "z"), "m", meaning="of the trunk, from which the pictures were rendered"),
     "quaternion": Field(("qw", "qx", "qy", "qz"), "1", meaning="attitude of the trunk, w x y z"),
     "joints": Field(tuple(f"joint_{j}" for j in range(18)), "rad", meaning="coxa, femur, tibia of legs 0 to 5"),
-    "u": Field(tuple(f"u_{side}" for side in hemifield.SIDES), "1", meaning="output of each eye's LGMD, 0.5 to 1"),
-    "feed_forward": Field(
-        tuple(f"feed_forward_{side}" for side in hemifield.SIDES), "grey", meaning="output of the FF cell"
-    ),
+    "u": Field(_both("u"), "1", meaning="output of each eye's LGMD, 0.5 to 1"),
+    "feed_forward": Field(_both("feed_forward"), "grey", meaning="output of the FF cell"),
     "excitation": Field(
-        tuple(f"excitation_{side}" for side in hemifield.SIDES),
+        _both("excitation"),
         "grey",
         meaning="mean excitation, before feed-forward inhibition",
     ),
-    "distances": Field(
-        tuple(f"distance_{side}" for side in hemifield.SIDES), "m", meaning="nearest obstacle in each hemifield"
-    ),
+    "distances": Field(_both("distance"), "m", meaning="nearest obstacle in each hemifield"),
     "corridor": Field(
-        tuple(f"corridor_{side}" for side in hemifield.SIDES),
+        _both("corridor"),
         "m",
         meaning="nearest obstacle in the way, on either side",
     ),
-    "label": Field(
-        tuple(f"label_{side}" for side in hemifield.SIDES), "0.05 m/s", meaning="velocity that the teacher commands"
-    ),
-    "velocity": Field(
-        tuple(f"velocity_{side}" for side in hemifield.SIDES), "0.05 m/s", meaning="velocity that the policy commands"
-    ),
+    "label": Field(_both("label"), "0.05 m/s", meaning="velocity that the teacher commands"),
+    "velocity": Field(_both("velocity"), "0.05 m/s", meaning="velocity that the policy commands"),
     "clearance": Field(("clearance",), "m", meaning="smallest distance to anything within the frame"),
     "contact": Field(("contact",), kind="b", meaning="whether the clearance was 0 or less"),
     "is_first": Field(("is_first",), kind="b", meaning="first frame after a start or reset"),

@@ -27,7 +27,7 @@ from lgmdjax.sensors import laser
 from lgmdjax.simulation import closed_loop
 from lgmdjax.simulation.assembly import select_policy
 from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS, Record, Room
-from lgmdjax.transfer import nerves, robot_model
+from lgmdjax.transfer import nervous_systems, robot_model
 from lgmdjax.transfer.cube_camera import CubeCamera
 from lgmdjax.transfer.faults import Faults, draw
 from lgmdjax.transfer.names import FaultName
@@ -103,7 +103,7 @@ class _Batch:
     ):
         self.robot, self.bodies, self.cameras, self.faults, self.keys = robot, bodies, cameras, faults, keys
         count = len(bodies)
-        self.states = nerves.init_batch(robot, faults, keys)
+        self.states = nervous_systems.init_batch(robot, faults, keys)
         self.resets, self.ok = np.zeros(count, np.int32), np.ones(count, bool)
         self.is_first, self.contact = np.ones(count, bool), np.zeros(count, bool)
         self.bearings = np.asarray(laser.bearings(robot.laser), float)
@@ -130,7 +130,7 @@ class _Batch:
         if lifted.any():
             self.resets, self.is_first = self.resets + lifted, self.is_first | lifted
             keys = jax.vmap(jax.random.fold_in)(self.keys, jnp.asarray(self.resets))
-            self.states = nerves.restart_batch(self.robot, self.faults, self.states, keys, jnp.asarray(lifted))
+            self.states = nervous_systems.restart_batch(self.robot, self.faults, self.states, keys, jnp.asarray(lifted))
             for index in np.flatnonzero(lifted).tolist():
                 body = self.bodies[index]
                 robot_model.reset(body.model, body.data, body.starts[self.resets[index] % len(body.starts)])
@@ -142,11 +142,11 @@ class _Batch:
         for index, eyes in enumerate(self.cameras):
             pictures[index] = eyes.render(self.bodies[index].data)
         ranges = np.stack([self._scan(body) for body in self.bodies])
-        self.states = nerves.see_batch(self.robot, self.faults, self.states, pictures, ranges)
+        self.states = nervous_systems.see_batch(self.robot, self.faults, self.states, pictures, ranges)
 
     def _move(self) -> np.ndarray:
         """Advance by one physics step; return which robots touched something in it."""
-        self.states, targets = nerves.move_batch(self.robot, self.faults, self.states)
+        self.states, targets = nervous_systems.move_batch(self.robot, self.faults, self.states)
         targets = np.asarray(targets, float).reshape(len(self.bodies), -1)
         touched = np.zeros(len(self.bodies), bool)
         for index in np.flatnonzero(self.ok).tolist():

@@ -12,7 +12,7 @@ from lgmdjax.evaluation import gait_test
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.simulation import assembly
 from lgmdjax.simulation.closed_loop import SUBSTEPS, Room
-from lgmdjax.transfer import faults, nerves, robot_model, walk
+from lgmdjax.transfer import faults, nervous_systems, robot_model, walk
 from lgmdjax.world import arena
 from lgmdjax.world.mujoco_world import PLAIN
 
@@ -48,18 +48,18 @@ def test_a_robot_without_faults_has_the_exported_nervous_system(robot):
     """Ten pictures, each followed by six set points, give what `nervous_system.step` gives."""
     none, exported = batch(faults.Faults()), nervous_system.from_robot(robot)
     rng, step = np.random.default_rng(0), jax.jit(nervous_system.step)
-    state, single = nerves.init_batch(robot, none, jax.random.key(0)[None]), nervous_system.init(exported)
+    state, single = nervous_systems.init_batch(robot, none, jax.random.key(0)[None]), nervous_system.init(exported)
     ranges = jnp.full((1, robot.laser.rays), robot.laser.max_range)
     smooth = np.cumsum(rng.normal(0, 4, (10, 2, robot.camera.height, robot.camera.width)), axis=3) + 120
     pictures = np.clip(np.round(smooth), 0, 255).astype(np.float32)
     responses = []
     for picture in pictures:
-        state = nerves.see_batch(robot, none, state, picture[None], ranges)
+        state = nervous_systems.see_batch(robot, none, state, picture[None], ranges)
         single, output = step(exported, single, picture.astype(np.uint8))
         responses.append(np.asarray(output.u))
         np.testing.assert_allclose(state.controller.velocity[0], output.velocity, atol=1e-5)
         for substep in range(SUBSTEPS):
-            state, targets = nerves.move_batch(robot, none, state)
+            state, targets = nervous_systems.move_batch(robot, none, state)
             np.testing.assert_allclose(targets[0], output.targets[substep], atol=1e-4)
     assert np.ptp(responses) > 0.01  # the pictures move the detectors
 
