@@ -17,14 +17,14 @@ from lgmdjax.simulation.closed_loop import FRAME_RATE
 from lgmdjax.simulation.episode_tables import COLUMNS, FIELDS, MEANINGS, ORIGIN, ORIGIN_MEANINGS, UNITS
 
 FILE = "README.md"
-LICENCE = "Apache-2.0"  # that of this package, whose own walks are given away under it
+LICENCE = "Apache-2.0"  # of this package, and of the walks that come with it
 FRAMES = """\
 World frame: x forward, y left, z up; the floor is z = 0. Left comes before right. A velocity of 1 is 0.05 m/s of that
 side's legs. Grey is 0 (black) to 255 (white).
 """
 LIMITS = """\
-All of it is simulated: MuJoCo's contacts, rendered pictures, a laser scanner without noise. After a contact the robot
-is put elsewhere at once (`resets`). Frames that are not `ok` hold the pose in which a robot fell.
+Everything is simulated: MuJoCo's contacts, rendered pictures, a laser scanner without noise. After a contact the robot
+is moved to another start at once (`resets`). Frames that are not `ok` hold the pose in which a robot fell.
 """
 
 

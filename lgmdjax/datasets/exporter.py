@@ -1,4 +1,4 @@
-"""Export recorded walks as a data set: one new folder, whole or not at all, with a card that says what it holds.
+"""Export recorded walks as a data set: one new folder, whole or not at all, with a card that describes it.
 
 | format  | files                                         | module                          | pictures       |
 | ------- | --------------------------------------------- | ------------------------------- | -------------- |
@@ -28,10 +28,10 @@ def export(
         out: the folder to write; it must be empty or missing.
         format: of the data set.
         video: render the eyes' pictures from the recorded poses, and write them too.
-        licence: that the data are given away under, by its name in the SPDX list.
+        licence: licence of the data, by its name in the SPDX list.
 
-    Raises InputError for an unknown format, a folder without walks, pictures in a format without, walks whose rooms
-    can't be made again, and a folder with files.
+    Raises InputError for an unknown format, a folder without walks, pictures in a format that holds none, walks whose
+    rooms cannot be made again, and an `out` that has files.
 
     ```python
     lj.datasets.exporter.export(Path("runs/quick-0"), Path("walks"), "lerobot", video=True)
@@ -43,7 +43,7 @@ def export(
         raise InputError(f"expected --video with format {' or '.join(WITH_PICTURES)}, got {format}; leave --video out")
     partial_files.require_empty(out)
     recording = recorded.read(run)
-    with jax.enable_x64(False), partial_files.new_folder(out) as folder:  # pictures of single precision, as the robot's
+    with jax.enable_x64(False), partial_files.new_folder(out) as folder:  # pictures in single precision, as the robot's
         eyes = pictures.find_eyes(recording) if video else None
         if format == "lerobot":
             lerobot.write(folder, recording, eyes)

@@ -3,14 +3,14 @@
 | file                                                    | contents                                                  |
 | ------------------------------------------------------- | --------------------------------------------------------- |
 | meta/info.json                                          | features with their names and units, counts, paths        |
-| meta/stats.json                                         | statistics of every feature, to normalise by              |
+| meta/stats.json                                         | statistics of every feature, for normalisation            |
 | meta/tasks.parquet                                      | the task, in words                                        |
 | meta/episodes/chunk-000/file-000.parquet                | frames, files and statistics of each episode              |
 | data/chunk-000/file-000.parquet                         | one row for each frame                                    |
-| videos/observation.images.left/chunk-000/file-000.mp4   | pictures of the left eye, and so of the right: H.264      |
+| videos/observation.images.left/chunk-000/file-000.mp4   | pictures of the left eye; the right likewise: H.264       |
 
-Frames in which the robot had fallen are left out. Numbers are in single precision. Videos lose a little; a picture is
-grey, in three equal channels. Files hold at most `FRAMES_PER_FILE` frames, in whole episodes.
+Frames in which the robot had fallen are left out. Numbers are in single precision. Videos are slightly lossy; their
+pictures are grey, in three equal channels. Files hold at most `FRAMES_PER_FILE` frames, in whole episodes.
 
 Source: the format of huggingface/lerobot 0.4 and newer ("codebase_version": "v3.0").
 """
@@ -75,9 +75,9 @@ class _Histograms:
 
 
 def write(folder: Path, recording: Recording, eyes: pictures.Eyes | None) -> None:
-    """Write the data set into a folder; with `eyes` their pictures too.
+    """Write the data set into a folder; with `eyes`, also their pictures.
 
-    Raises InputError for walks that never were ok, for another frame rate, and for pictures of an odd size.
+    Raises InputError for walks without any frame that is ok, another frame rate, and pictures of an odd size.
     """
     episodes = _lay_out(recording.walks)
     width, height = (0, 0) if eyes is None else (eyes.settings.width, eyes.settings.height)
@@ -98,7 +98,7 @@ def write(folder: Path, recording: Recording, eyes: pictures.Eyes | None) -> Non
 
 
 def _lay_out(walks: list[Walk]) -> list[_Episode]:
-    """Return the episodes, with as many in each file as it has room for."""
+    """Return the episodes, with as many in each file as fit."""
     found: list[_Episode] = []
     first = first_in_file = file = 0
     for number, (walk, frames) in enumerate(cut_episodes(walks)):

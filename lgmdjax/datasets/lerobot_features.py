@@ -26,11 +26,11 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "clearance": ("clearance",),
     "contact": ("contact",),
 }
-"""The fields of `Record` in each feature. LeRobot gives a policy what begins with "observation"; no other is sensed."""
+"""The fields of `Record` in each feature. LeRobot gives a policy the features that begin with "observation"."""
 CAMERAS = tuple(f"observation.images.{side}" for side in hemifield.SIDES)
 INDICES = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64"}
 INDICES |= {"task_index": "int64", "next.done": "bool"}
-"""Features that LeRobot asks for, and the end of an episode."""
+"""Features that LeRobot requires, and the end of an episode."""
 
 
 def info(episodes: int, frames: int, eyes: Eyes | None) -> JsonObject:

@@ -1,7 +1,7 @@
 """Both eyes' whole pictures of recorded walks, rendered again from the poses, in grey levels of 8 bits.
 
-Recorded walks hold no pictures, but what they were recorded with gives their rooms and their camera. That these are the
-right ones is checked: the detector has to give the recorded u of the first `CHECKED_FRAMES` of each walk.
+Recorded walks hold no pictures, but their header says which rooms and camera they were recorded with. The pictures are
+checked: for the first `CHECKED_FRAMES` of each walk, the detector must give the recorded u.
 """
 
 from collections.abc import Iterator
@@ -23,8 +23,8 @@ from lgmdjax.simulation import assembly, episodes, rerender
 from lgmdjax.simulation.episodes import Walk
 from lgmdjax.world.arena import Arena
 
-CHECKED_FRAMES = 3 * rerender.FRAMES_PER_CALL  # rendered at once, too
-SETTLING_FRAMES = 2  # not compared: a walk may begin with frames that the detector compares with earlier ones
+CHECKED_FRAMES = 3 * rerender.FRAMES_PER_CALL  # this many are also rendered at once
+SETTLING_FRAMES = 2  # not compared: u of a walk's first frames may depend on earlier ones
 TOLERANCE = 0.02  # largest RMS difference of u, in standard deviations of the recorded u
 
 Pictures = UInt8[np.ndarray, "frames 2 height width"]
@@ -53,7 +53,7 @@ def find_eyes(recording: Recording) -> Eyes:
 
 
 def find_rooms(recording: Recording) -> list[Arena]:
-    """Return the room of each walk, made again from seeds; raise `InputError` if the header does not tell how."""
+    """Return the room of each walk, made again from seeds; raise `InputError` if the header does not say how."""
     walks = recording.walks
     try:
         return recorded_rooms.find_rooms(recording.parameters, walks, len(walks), recording.folder)
@@ -62,7 +62,7 @@ def find_rooms(recording: Recording) -> list[Arena]:
 
 
 def render(eyes: Eyes, room: Arena, walk: Walk) -> Iterator[Pictures]:
-    """Yield the pictures of a walk, some seconds at a time; raise `InputError` if they don't give the recorded u."""
+    """Yield the pictures of a walk, some seconds at a time; raise `InputError` if they do not give the recorded u."""
     whole = replace(assembly.camera_params(eyes.settings), overlap=1.0, ground=0.0)
     rooms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], room)
     for first in range(0, len(walk), CHECKED_FRAMES):
@@ -74,7 +74,7 @@ def render(eyes: Eyes, room: Arena, walk: Walk) -> Iterator[Pictures]:
 
 
 def _check(eyes: Eyes, walk: Walk, pictures: Float[np.ndarray, "frames 2 height width"]) -> None:
-    """Raise `InputError` unless the detector gives the recorded u; u of a policy without camera is constant."""
+    """Raise `InputError` unless the detector gives the recorded u; not checked if it is constant (no camera)."""
     if len(walk) <= SETTLING_FRAMES or np.ptp(walk.u) == 0:
         return
     field = {"overlap": eyes.settings.overlap, "ground": eyes.settings.ground}
@@ -96,7 +96,7 @@ def _check(eyes: Eyes, walk: Walk, pictures: Float[np.ndarray, "frames 2 height 
 def respond(
     detector: lgmd.Params, pictures: Float[Array, "frames 2 rows columns"], is_first: Bool[Array, " frames"]
 ) -> Float[Array, "frames 2"]:
-    """Return u of both eyes' LGMDs for pictures of their hemifields; each first frame starts them anew."""
+    """Return u of both eyes' LGMDs for pictures of their hemifields; each first frame restarts them."""
 
     def frame(state: lgmd.State, inputs: tuple[Array, Array]) -> tuple[lgmd.State, Array]:
         images = hemifield.outermost_first(inputs[0])

@@ -12,7 +12,7 @@ from lgmdjax.simulation import episodes
 from lgmdjax.simulation.episodes import Walk
 
 PLACES = (".", "collect/episodes", "trial")
-"""Where the walks are in a folder of walks, in a run folder (those of the teacher), and in the folder of a trial."""
+"""Where the walks are: in a folder of walks, in a run folder (the teacher's), in the folder of a trial."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Rooms of recorded walks, made again from seeds: walks hold no rooms, but their header says how these were made.
+"""Rooms of recorded walks, made again from seeds: walks hold no rooms, but their header says how to make them.
 
 | header has  | walks of                        | rooms                                |
 | ----------- | ------------------------------- | ------------------------------------ |
@@ -26,7 +26,7 @@ from lgmdjax.world.arena import Arena
 
 
 def find_rooms(parameters: JsonObject, walks: Sequence[Walk], recorded: int, folder: Path) -> list[Arena]:
-    """Return the room of each walk; raise `InputError` if the header does not tell how it was made.
+    """Return the room of each walk; raise `InputError` if the header does not say how it was made.
 
     Args:
         parameters: in the header of the walks.

@@ -1,4 +1,4 @@
-"""Statistics of features as LeRobot normalises by them: extremes, mean, standard deviation, quantiles, count."""
+"""Statistics of features, with which LeRobot normalises: extremes, mean, standard deviation, quantiles, count."""
 
 from collections.abc import Mapping
 

@@ -25,11 +25,11 @@ from lgmdjax.simulation.episode_tables import FIELDS, ORIGIN, ORIGIN_MEANINGS
 ROWS_PER_CHUNK = 2**16
 PICTURES_PER_CHUNK = 256
 COMPRESSION = {"name": "gzip", "configuration": {"level": 5}}
-AXES = {"joints": ("leg", "joint"), "position": ("axis",), "quaternion": ("component",)}  # of the others ("side",)
+AXES = {"joints": ("leg", "joint"), "position": ("axis",), "quaternion": ("component",)}  # of all others ("side",)
 
 
 def write(folder: Path, recording: Recording, eyes: pictures.Eyes | None) -> None:
-    """Write the arrays into a folder; with `eyes` their pictures too."""
+    """Write the arrays into a folder; with `eyes`, also their pictures."""
     walks = recording.walks
     attributes: JsonObject = {"recorded_with": recording.parameters, "versions": recording.header.get("versions", {})}
     storage.write_json(folder / "zarr.json", {"zarr_format": 3, "node_type": "group", "attributes": attributes})
@@ -52,7 +52,7 @@ def _write_array(path: Path, values: np.ndarray, axes: tuple[str, ...], attribut
 
 
 def _write_pictures(folder: Path, recording: Recording, eyes: pictures.Eyes) -> None:
-    """Write the pictures in whole chunks, since a chunk is compressed anew with each write."""
+    """Write the pictures in whole chunks, since each write compresses its chunk again."""
     height, width = eyes.settings.height, eyes.settings.width
     rows = sum(map(len, recording.walks))
     stores = []

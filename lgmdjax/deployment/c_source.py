@@ -1,7 +1,8 @@
 """The nervous system as C99: one file without allocation and without any library but libm, and its header.
 
 The two templates of this wing hold the functions, with the names and equations of the Python modules; this module fills
-in sizes and parameters. Nothing is computed here but a change of layout, so that inner loops run along memory.
+in sizes and parameters. It computes nothing; it only changes the layout of arrays, so that inner loops read memory in
+order.
 """
 
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ class Constant:
         return np.ndim(self.value) > 0
 
     def declaration(self) -> str:
-        """Return the line that says what it is: all of a number, of a table its type.
+        """Return the declaration in C: of a number with its value, of a table without.
 
         >>> print(Constant(name="THRESHOLD", value=0.1, comment="T_s, grey").declaration())
         static const float THRESHOLD = 0.1f;  /* T_s, grey */
@@ -67,9 +68,9 @@ def generate(params: Params, robot: str) -> dict[str, str]:
 
     Args:
         params: of the nervous system.
-        robot: where its robot comes from, for the first comment.
+        robot: name of its robot, for the first comment.
 
-    Raises InputError for forms of the components that the C program does not have.
+    Raises InputError for forms of the components that the C program does not support.
     """
     _check(params)
     environment = jinja2.Environment(
@@ -110,19 +111,19 @@ def sizes(params: Params) -> dict[str, int]:
 
 
 def private_sizes(params: Params) -> dict[str, tuple[int, str]]:
-    """Return the other sizes, and what they are."""
+    """Return the other sizes, and a comment on each."""
     seen, pooling = sizes(params), params.controller.lgmd.pooling
     _, row_parts = cells.pooling_parts(seen["SEEN_ROWS"], pooling)
     _, column_parts = cells.pooling_parts(seen["SEEN_COLUMNS"], pooling)
     inputs = params.controller.policy.weights["cell"]["dense_i"]["kernel"].shape[0]
     return {
-        "LINE_PARTS": (row_parts * seen["ROWS"] // seen["SEEN_ROWS"], "of which a line of pixels consists"),
-        "ROW_PARTS": (row_parts, "of which a row of cells consists"),
+        "LINE_PARTS": (row_parts * seen["ROWS"] // seen["SEEN_ROWS"], "in a line of pixels"),
+        "ROW_PARTS": (row_parts, "in a row of cells"),
         "PIXEL_PARTS": (
             column_parts * seen["COLUMNS"] // seen["SEEN_COLUMNS"],
-            "of which the width of a pixel consists",
+            "in the width of a pixel",
         ),
-        "COLUMN_PARTS": (column_parts, "of which the width of a cell consists"),
+        "COLUMN_PARTS": (column_parts, "in the width of a cell"),
         "INPUTS": (inputs, "of the LSTM"),
         "CPG_STEPS": (params.controller.cpg.substeps, "Runge-Kutta steps for each move"),
         "SHAPING_UNITS": (shaping.UNITS, "of each shaping network"),
@@ -130,7 +131,7 @@ def private_sizes(params: Params) -> dict[str, tuple[int, str]]:
 
 
 def memory(params: Params) -> dict[str, int]:
-    """Return the sizes of the state and of all constants [bytes], of 4 bytes a number."""
+    """Return the sizes of the state and of all constants [bytes], at 4 bytes a number."""
     size = sizes(params)
     pooled = size["ROWS"] * size["COLUMNS"]
     bordered = (size["ROWS"] + 2 * size["RADIUS"]) * (size["COLUMNS"] + 2 * size["RADIUS"])
@@ -140,7 +141,7 @@ def memory(params: Params) -> dict[str, int]:
 
 
 def constants(params: Params) -> list[Constant]:
-    """Return all parameters, and the state of a robot that was just put on its feet."""
+    """Return all parameters, and the state at the start."""
     groups = (_lgmd_constants, _navigator_constants, _cpg_constants, _shaping_constants)
     return [Constant(name=name, value=value, comment=text) for group in groups for name, value, text in group(params)]
 
@@ -200,7 +201,7 @@ def _shaping_constants(params: Params) -> Rows:
     networks = params.controller.shaping
     first_layer = np.array(networks.w1)
     if networks.printed_input:
-        first_layer[:, 1] = 0  # the adaptation difference, which these networks do not see
+        first_layer[:, 1] = 0  # the adaptation difference, which these networks do not use
     return [
         ("SHAPING_W1", first_layer, "by leg, input (output, adaptation difference, velocity), unit"),
         ("SHAPING_B1", networks.b1, "by leg and unit"),
@@ -217,12 +218,14 @@ def _by_gate(kernel: Array) -> np.ndarray:
 
 
 def _check(params: Params) -> None:
-    """Raise `InputError` for forms of the components that the C program does not have."""
+    """Raise `InputError` for forms of the components that the C program does not support."""
     detector, policy = params.controller.lgmd, params.controller.policy
     if not policy.variant.startswith("lstm"):
         raise InputError(f"expected an LSTM as the navigator for C, got {policy.variant}; export other formats")
     if detector.smooth or detector.printed_feed_forward or detector.printed_gate:
-        raise InputError("expected an LGMD with steps and corrected equations for C, got another; export other formats")
+        raise InputError(
+            "expected an LGMD with hard thresholds and corrected equations for C, got another; export other formats"
+        )
     private = {name: size for name, (size, _) in private_sizes(params).items()}
     if 255 * private["ROW_PARTS"] * private["COLUMN_PARTS"] >= 2**32:
         raise InputError(
@@ -232,7 +235,7 @@ def _check(params: Params) -> None:
 
 
 def _number(value: np.float32) -> str:
-    """Return a number in C, with as many digits as tell it from its neighbours."""
+    """Return a number in C, with as many digits as distinguish it from its neighbours."""
     return f"{value!s}f"
 
 

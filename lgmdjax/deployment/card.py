@@ -1,8 +1,8 @@
-"""The card of an exported nervous system: what a person needs who builds the robot around it, as JSON.
+"""The card of an exported nervous system: all that one needs to build a robot around it, as JSON.
 
 | key      | contents                                                                                        |
 | -------- | ----------------------------------------------------------------------------------------------- |
-| robot    | where it comes from, and the fingerprint of its parameters                                      |
+| robot    | its name, and the fingerprint of its parameters                                                 |
 | eyes     | size, rate and layout of the pictures, and where the cameras sit                                |
 | lgmd     | thresholds and cells of the detectors                                                           |
 | velocity | unit, range and order of v                                                                      |
@@ -10,7 +10,7 @@
 | memory   | of the C program: state, constants [bytes]                                                      |
 | inputs, outputs, state | name, shape and type of every array; of the state also its value before the first picture |
 | training | header of the navigator: teacher, rooms, settings, seed, versions                               |
-| scores   | of the learned policy, by trial, as stage evaluate measured them; null if it did not             |
+| scores   | of the learned policy, by trial, as stage evaluate measured them; null if it did not run         |
 | files    | size and SHA-256 of the other files                                                             |
 | versions | of the packages that exported it                                                                |
 """
@@ -37,7 +37,7 @@ from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS
 
 FILE = "card.json"
 FORMAT, VERSION = "lgmdjax nervous system", 1
-ZERO = "leg straight out along its mount, femur level, tibia plumb; positive coxa turns left, femur and tibia lift"
+ZERO = "leg straight out along its mount, femur level, tibia vertical; positive coxa turns left, femur and tibia lift"
 
 
 def describe(params: Params) -> JsonObject:

@@ -28,12 +28,12 @@ CONTROLLER = "controller.safetensors"
 def export(run: Path | None, out: Path, *, width: int | None = None, formats: Sequence[Format] = FORMATS) -> JsonObject:
     """Write the nervous system of a robot into a new folder, whole or not at all; return its card.
 
-    In single precision, whatever the present precision of JAX.
+    The export is in single precision, whatever the present precision of JAX.
 
     Args:
         run: run folder of the robot; the pretrained robot if None.
         out: the folder to write; it must be empty or missing.
-        width: of the pictures [px], by default as in training; the LGMD's cells cover the same angle at any.
+        width: of the pictures [px], by default as in training; the LGMD's cells cover the same angle at any width.
         formats: which programs to write.
 
     Raises InputError for a folder with files, a run without a controller, an impossible width, a missing library.
@@ -65,7 +65,7 @@ def export(run: Path | None, out: Path, *, width: int | None = None, formats: Se
 
 
 def load(run: Path | None, width: int | None = None) -> nervous_system.Params:
-    """Return the nervous system of a robot, in single precision; arguments and errors as of `export`."""
+    """Return the nervous system of a robot, in single precision; arguments and errors as in `export`."""
     with jax.enable_x64(False):
         return nervous_system.from_robot(_load_robot(run, width))
 
@@ -85,7 +85,9 @@ def _stage_folders(run: Path | None) -> tuple[Path, Path]:
     if run is None:
         return PRETRAINED_DIR, PRETRAINED_DIR
     if not run.is_dir():
-        raise InputError(f"expected a run folder or the word {PRETRAINED}, got {run}, which is no folder; name another")
+        raise InputError(
+            f"expected a run folder or the word {PRETRAINED}, got {run}, which is not a folder; name another"
+        )
     if not (run / "train" / CONTROLLER).is_file():
         raise InputError(
             f"expected a run with a controller, got {run} without train/{CONTROLLER}; "

@@ -2,7 +2,7 @@
 
 `step` is one camera frame of the closed loop without its body, composed of the same functions of
 `lgmdjax.control.controller`: both LGMDs and the navigator once, then CPG and shaping `SUBSTEPS` times. The other
-modules of this wing write this function in other languages.
+modules of this wing export this function in other formats.
 
 | symbol | name                   | unit                 | shape         | equation       |
 | ------ | ---------------------- | -------------------- | ------------- | -------------- |
@@ -11,7 +11,7 @@ modules of this wing write this function in other languages.
 | v      | output.velocity        | nominal, 0.05 m/s    | (2,)          | 17             |
 | -      | output.targets         | rad                  | (6, 6, 3)     | sec. 3.2       |
 
-The pictures are whole; `step` takes the hemifield of each eye out of them. Axes of the targets: substep, leg, joint.
+The pictures are whole; `step` crops them to the hemifield of each eye. Axes of the targets: substep, leg, joint.
 The first row is for now, each further row for 1 / (`FRAME_RATE` `SUBSTEPS`) s later. As in `hexapod.substep`, targets
 are clipped to the servos' limits.
 """
@@ -69,7 +69,7 @@ class Output:
 def from_robot(robot: closed_loop.Params) -> Params:
     """Return the nervous system of a robot with all five policies, as `assembly.load_robot` returns it.
 
-    Raises InputError for a robot that holds u from one picture to another frame, which is a study's.
+    Raises InputError for a robot that does not see in every frame (`frame_stride`), as in one study.
     """
     if robot.frame_stride is not None:
         raise InputError(f"expected a robot that sees in every frame, got stride {robot.frame_stride}; set it to None")

@@ -26,7 +26,7 @@ OPSET = 18  # of 2022; onnxruntime 1.14 and newer run it
 
 
 def check_installed() -> None:
-    """Raise `InputError` where jax2onnx is missing."""
+    """Raise `InputError` if jax2onnx is missing."""
     if not HAS_JAX2ONNX:
         raise InputError(
             f"expected jax2onnx to write {FILE}, got an environment without it; pip install 'lgmdjax[onnx]' in an "
@@ -37,11 +37,11 @@ def check_installed() -> None:
 def write(folder: Path, params: Params) -> None:
     """Write the graph, with the parameters as its constants, into a folder."""
     check_installed()
-    # jax2onnx converts a traced program, but fails at modules of flax inside of `vmap`.
+    # jax2onnx converts a traced program, but fails on modules of flax inside `vmap`.
     traced = jax.make_jaxpr(nervous_system.by_name(params))(*nervous_system.argument_types(params))
     inputs, outputs = io_names(params)
     values = [id(variable) for variable in traced.jaxpr.outvars]
-    first = [values.index(value) for value in values]  # an array that has two names is an output of jax2onnx once
+    first = [values.index(value) for value in values]  # jax2onnx returns an array with two names only once
 
     def distinct(*leaves: Array) -> list[Array]:
         return [leaf for index, leaf in enumerate(jaxpr_as_fun(traced)(*leaves)) if first[index] == index]

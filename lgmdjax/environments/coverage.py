@@ -1,18 +1,18 @@
 """New floor: which cells of 0.25 m a robot has entered since its episode began, and how much of each it has covered.
 
-Two measures of the same, the second with a derivative:
+Of the two measures, only the second has a derivative that is not zero:
 
 | measure | in a frame                                                              | derivative by the position     |
 | ------- | ----------------------------------------------------------------------- | ------------------------------ |
 | entered | 1 if the trunk's centre enters a cell for the first time, else 0        | zero                           |
-| covered | sum over cells i of max(c_i, w_i(x)) - c_i; then c_i becomes the first   | that of the w_i which grow     |
+| covered | sum over cells i of max(c_i, w_i(x)) - c_i; the maximum is the next c_i  | that of the w_i which grow     |
 
 w_i(x) = max(0, 1 - |x - x_i| / CELL) max(0, 1 - |y - y_i| / CELL) is the share of a square of one cell around the robot
-that lies in cell i. The shares sum to 1, so a robot that walks straight along the axes over new floor covers one cell
-every 0.25 m, on whatever line, and both measures grow alike. `metrics.count_cells` counts what is entered by a path
-that is averaged over a gait cycle; sway can enter a few cells more.
+that lies in cell i. The shares sum to 1, so a robot that walks straight along an axis over new floor covers one cell
+every 0.25 m, on any line, and both measures grow alike. `metrics.count_cells` counts the cells that a path averaged
+over a gait cycle enters; `entered` can be a few more, because of sway.
 
-The grid repeats every `GRID` cells: no room may be larger.
+The grid repeats every `GRID` cells, so no room may be larger.
 """
 
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The robot in a room as an environment of reinforcement learning, for those who stay in JAX: `reset` and `step`.
+"""The robot in a room as an environment of reinforcement learning, for use from JAX: `reset` and `step`.
 
 ```python
 import jax
@@ -10,12 +10,12 @@ transition = jax.jit(functional.Environment.step)(environment, jax.random.key(1)
 ```
 
 Both are pure functions; `jit`, `vmap`, `scan` and derivatives are the caller's. A step is one camera frame, 1/30 s: the
-action is carried out, and the observation is made from where the robot is then. A rollout (`lgmdjax.simulation`) does
-the same from the same room if its policy chooses the same actions.
+action is carried out, and the observation is made from the robot's new pose. A rollout (`lgmdjax.simulation`) in the
+same room walks the same if its policy chooses the same actions.
 
 An episode begins at a start of a room, both drawn with the key. It is terminated by a touch of an obstacle or a wall
-and by a fall, and truncated when its time is up. The step after that ignores its action, draws a new room and start
-with its key, and rewards nothing (Gymnasium's `AutoresetMode.NEXT_STEP`); so no step renders twice.
+and by a fall, and truncated when its time is up. The next step ignores its action, draws a new room and start with its
+key, and has no reward (Gymnasium's `AutoresetMode.NEXT_STEP`); so no step renders twice.
 
 | observation | shape              | unit           | what                                                    |
 | ----------- | ------------------ | -------------- | ------------------------------------------------------- |
@@ -28,11 +28,11 @@ with its key, and rewards nothing (Gymnasium's `AutoresetMode.NEXT_STEP`); so no
 | velocity | (2,)  | nominal, 0.05 m/s: -1 to 2 | of the left and the right legs; CPG and shaping networks move them |
 | joints   | (18,) | rad                        | servo set points, leg by leg (`hexapod.LEGS`): coxa, femur, tibia  |
 
-Velocities beyond the gait's range are limited as those of all policies are (`braitenberg.limit`), set points by the
-servos' limits.
+Velocities beyond the gait's range are limited as for all policies (`braitenberg.limit`), set points by the servos'
+limits.
 
-Gradient: by action, state and the robot's parameters, through whatever the reward and the observation depend on. None
-through the choice of a room and the end of an episode.
+Gradient: by action, state and the robot's parameters, through all that reward and observation depend on, except the
+choice of a room and the end of an episode.
 """
 
 import math
@@ -67,7 +67,7 @@ Tree = TypeVar("Tree")
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What an environment shows, takes and rewards; hashable, so that one compiled program serves equal ones."""
+    """Observation, action and reward; hashable, so that equal settings share one compiled program."""
 
     observation: ObservationName
     action: ActionName
@@ -86,7 +86,7 @@ class State:
     """State of one robot within its episode."""
 
     robot: closed_loop.State
-    sensed: policies.Observation  # from where the robot is; a critic may see more of it than the actor
+    sensed: policies.Observation  # at the present pose; a critic may use more of it than the actor
     floor: coverage.State
     room: Int[Array, ""]  # number of the room
     start: Int[Array, ""]  # number of the room's start
@@ -106,7 +106,7 @@ class Transition(NamedTuple):
 
 @struct.dataclass(kw_only=True)
 class Environment:
-    """A robot and the rooms that its episodes are in, as a pytree; from `make`."""
+    """A robot and the rooms of its episodes, as a pytree; from `make`."""
 
     params: closed_loop.Params
     model: mjx.Model
@@ -119,14 +119,14 @@ class Environment:
         return self._observe(self._begin(key))
 
     def ended(self, key: Array) -> State:
-        """Return the state of an episode that has ended, whose next step is `reset`.
+        """Return the state of an episode that has ended, so that the next step does what `reset` does.
 
-        A loop that begins with it has one program for both, which halves the time of compilation.
+        A loop that begins with it needs one program instead of two, which halves the time of compilation.
         """
         return replace(self._begin(key), done=jnp.asarray(True))
 
     def step(self, key: Array, state: State, action: Float[Array, " action"]) -> Transition:
-        """Return what follows from an action, one frame later; after the end of an episode, the next one's start.
+        """Return the transition that an action causes in one frame; after the end of an episode, the start of the next.
 
         Args:
             key: draws the next episode's room and start, if the last one has ended.
@@ -167,7 +167,7 @@ class Environment:
         )
 
     def _move(self, state: State, action: Float[Array, " action"]) -> tuple[State, Outcome]:
-        """Carry out an action; return the state before its observation, and what the frame brought."""
+        """Carry out an action; return the state, not yet observed, and the outcome of the frame."""
         targets, velocity = None, jnp.zeros(2)
         if self.settings.action == "velocity":
             velocity = braitenberg.limit(policies.GAIT_RANGE, action)
@@ -220,9 +220,9 @@ def make(
         observation: what the robot observes (module's table).
         action: what it commands (module's table).
         room: "random" for random rooms; the name of a trial for its rooms (`trials.TRIALS`), from the trial's start;
-            or a batch of rooms of yours (`lgmdjax.simulation.room_batches`), from any of their starts.
+            or a batch of your own rooms (`lgmdjax.simulation.room_batches`), from any of their starts.
         reward: its name, or a function of the outcome (`lgmdjax.environments.rewards`).
-        robot: whose body, gait, camera and LGMDs are used; the pretrained one by default. Its policies are not.
+        robot: its body, gait, camera and LGMDs are used, not its policies; the pretrained robot by default.
         seconds: of robot time after which an episode is truncated.
         vision_gradient: whether derivatives pass through the pictures, which costs twice as much as all the rest.
 

@@ -15,11 +15,12 @@ many = gymnasium.make_vec("lgmdjax/Hexapod-v0", num_envs=16)
 | HexapodEnv       | NumPy                   | one                                                 |
 | HexapodVectorEnv | JAX (`metadata["jax"]`) | many: one compiled program, spread over JAX's devices |
 
-Spaces are those of the tables in `functional`, with their units; pictures are integers of 8 bits here, as a camera's
-are. An action of another shape, or one that is not finite, raises `InputError`. Each `info` holds what the frame
-brought (`rewards.Outcome`) under the names of its fields.
+Spaces are those of the tables in `functional`, with their units, but pictures are integers of 8 bits, as a camera's
+are. An action of another shape, or one that is not finite, raises `InputError`. Each `info` holds the outcome of the
+frame (`rewards.Outcome`) under the names of its fields.
 
-An ended episode of a vector begins anew in the next step (`AutoresetMode.NEXT_STEP`).
+In the vector environment, a robot whose episode has ended starts the next one in the next step
+(`AutoresetMode.NEXT_STEP`).
 """
 
 from functools import partial
@@ -101,7 +102,7 @@ class HexapodEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Args:
             seed: of this episode's room and start, and of all that follow.
-            options: there are none.
+            options: not used.
         """
         super().reset(seed=seed)
         key = jax.random.key(int(self.np_random.integers(2**31)))
@@ -178,7 +179,7 @@ class HexapodVectorEnv(VectorEnv[Array, Array, Array]):
 
         Args:
             seed: of these episodes' rooms and starts, and of all that follow.
-            options: there are none.
+            options: not used.
         """
         super().reset(seed=seed)
         self.key = jax.random.key(int(self.np_random.integers(2**31)))
@@ -218,7 +219,7 @@ def ended_batch(environment: Environment, key: Array, *, robots: int) -> State:
 def step_batch(
     environment: Environment, key: Array, states: State, actions: Float[Array, "robots action"]
 ) -> tuple[Transition, Array]:
-    """Step a batch of robots, spread over devices; return what follows, and the next key."""
+    """Step a batch of robots, spread over devices; return their transitions, and the next key."""
     keys = jax.random.split(key, len(actions) + 1)
     return sharding.shard_robots(jax.vmap(environment.step), keys[1:], states, actions), keys[0]
 
@@ -227,7 +228,7 @@ _ended, _step = jax.jit(Environment.ended), jax.jit(Environment.step)
 
 
 def _to_space(observation: Array, space: spaces.Box) -> Array:
-    """Return observations with the numbers of their space: grey levels are rounded."""
+    """Return observations in the range and dtype of their space; grey levels are rounded."""
     exact = jnp.round(observation) if space.dtype == np.uint8 else observation
     return jnp.clip(exact, float(space.low.min()), float(space.high.max())).astype(space.dtype)
 

@@ -1,4 +1,4 @@
-"""Rewards: what a frame brought, and two ways to weigh it. A reward of yours is a function of `Outcome` too.
+"""Rewards: the outcome of a frame, and two functions of it. Your own reward is a function of `Outcome` too.
 
 | name  | reward of a frame                                                                                 |
 | ----- | ------------------------------------------------------------------------------------------------- |
@@ -6,8 +6,8 @@
 | floor | floor covered for the first time [cells], less `END_COST` for a touch or a fall, less               |
 |       | `NEAR_COST` max(0, 1 - clearance / `NEAR`)^2                                                        |
 
-`floor` is for methods that follow the derivative: that of `cells` is zero, as is that of a touch. Both are about 20 a
-minute for a robot that avoids obstacles and goes on (`lgmdjax.evaluation.metrics`, coverage).
+`floor` is for methods that use the derivative; that of `cells` is zero, and so is that of a touch. Both rewards are
+about 20 a minute for a robot that avoids obstacles and keeps walking (`lgmdjax.evaluation.metrics`, coverage).
 """
 
 from collections.abc import Callable
@@ -21,16 +21,16 @@ from lgmdjax.errors import InputError
 from lgmdjax.minmax import maximum
 
 END_COST = 10.0  # cells, of a touch or a fall: half a minute of walking over new floor
-NEAR = 0.15  # m, clearance below which `floor` pays for being near
+NEAR = 0.15  # m, clearance below which `floor` is reduced
 NEAR_COST = 0.02  # cells a frame, at a clearance of zero
 
 RewardName = Literal["cells", "floor"]
-"""Names of the rewards that are there."""
+"""Names of the rewards of this module."""
 
 
 @struct.dataclass(kw_only=True)
 class Outcome:
-    """What one frame brought."""
+    """The outcome of one frame."""
 
     position: Float[Array, "3"]  # m, of the trunk
     quaternion: Float[Array, "4"]  # w x y z

@@ -1,4 +1,4 @@
-"""Cameras and servos: the trained nervous system on a robot, or on the simulated robot that stands in for one."""
+"""Cameras and servos: the trained nervous system drives a real robot or a simulated one."""
 
 import lazy_loader
 

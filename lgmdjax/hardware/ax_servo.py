@@ -1,6 +1,6 @@
 """The servos AX-12A and AX-18A: addresses of the control table, units, instructions and error bits.
 
-| quantity    | unit of the table                | range                                         |
+| quantity    | unit in the table                | range                                         |
 | ----------- | -------------------------------- | --------------------------------------------- |
 | position    | 300 degrees / 1023               | 0 (150 degrees clockwise) to 1023             |
 | speed       | 0.111 rpm                        | 0 (as fast as the voltage allows) to 1023     |
@@ -9,10 +9,10 @@
 | voltage     | 0.1 V                            |                                               |
 | temperature | 1 degree Celsius                 |                                               |
 
-Seen from the horn, higher positions are counter-clockwise. Addresses below `RAM` survive without power; each of them
-can be written some thousand times. A goal that is written turns the torque on.
+Seen from the horn, higher positions are counter-clockwise. Entries at addresses below `RAM` are kept without power;
+each can be written only some thousand times. Writing a goal position turns the torque on.
 
-Source: maker's e-manual of the AX-12A and AX-18A, and of the DYNAMIXEL Protocol 1.0.
+Source: the maker's e-manual of the AX-12A and AX-18A, and of the DYNAMIXEL Protocol 1.0.
 """
 
 import math
@@ -83,7 +83,7 @@ RAM = 24  # first address that is lost without power
 TABLE_SIZE = 50  # bytes
 BROADCAST = 254  # the id that means all servos
 HIGHEST_ID = 252
-BAUD_RATE = 1_000_000  # bit/s, as servos leave the factory
+BAUD_RATE = 1_000_000  # bit/s, the factory setting
 BITS_PER_BYTE = 10  # on the wire: start, eight bits, stop
 DELAY_UNIT = 2e-6  # s, of the return delay
 MODELS = {12: "AX-12A", 18: "AX-18A"}
@@ -95,7 +95,7 @@ LOAD_CLOCKWISE = 1024  # bit of the load and of the present speed
 
 
 def from_signed(value: int) -> int:
-    """Return the number of a present speed or load, positive counter-clockwise.
+    """Return a present speed or load as a signed number, positive counter-clockwise.
 
     >>> from_signed(5), from_signed(LOAD_CLOCKWISE + 5)
     (5, -5)
@@ -104,7 +104,7 @@ def from_signed(value: int) -> int:
 
 
 def to_signed(value: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
-    """Return the entries of the table for speeds or loads, positive counter-clockwise, cut off at 1023.
+    """Return the table entries of signed speeds or loads (positive counter-clockwise), at most 1023 in size.
 
     >>> to_signed(np.array([5.0, -5.0])).tolist()
     [5, 1029]
@@ -114,7 +114,7 @@ def to_signed(value: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
 
 
 def speed_entry(speed: float) -> int:
-    """Return the entry for a highest speed [rad/s], at least 1: 0 would mean no limit.
+    """Return the table entry of a speed limit [rad/s], at least 1, because 0 means no limit.
 
     >>> speed_entry(0.0), speed_entry(6.18)
     (1, 532)

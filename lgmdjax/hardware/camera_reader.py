@@ -1,4 +1,4 @@
-"""The newest pictures of one camera or two, read on threads of their own, as pictures of both eyes."""
+"""The newest pictures of both eyes, from one camera or two that are read on background threads."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -18,10 +18,10 @@ from lgmdjax.reporting import video_geometry, video_io
 from lgmdjax.sensors import camera
 
 FIRST_TIMEOUT = 20.0  # s for the first picture
-SILENCE = 10.0  # s without a picture after which a live source is opened again
-CLOSING = 0.5  # s of the wall
-RETRY_INTERVAL = 0.5  # s of the wall between two attempts
-PAIR_TOLERANCE = 0.5  # of a period, between the pictures of two cameras
+SILENCE = 10.0  # s without a picture after which a live source is reopened
+CLOSING = 0.5  # s of wall-clock time to wait for a thread to end
+RETRY_INTERVAL = 0.5  # s of wall-clock time between two attempts
+PAIR_TOLERANCE = 0.5  # largest time between the pictures of two cameras, in periods
 PERIOD = 1 / 30  # s
 
 Picture = UInt8[np.ndarray, "height width"]
@@ -29,7 +29,7 @@ Picture = UInt8[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class Frame:
-    """Pictures of both eyes, their number, and when they came [s]."""
+    """Pictures of both eyes, their number, and the time of their arrival [s]."""
 
     number: int
     time: float
@@ -37,12 +37,12 @@ class Frame:
 
 
 class Source(threading.Thread):
-    """One source, whose pictures a thread hands on one by one until it ends or is stopped.
+    """A thread that reads one source and passes each picture on, until the source ends or the thread is stopped.
 
     Args:
         name: device, address, pipe or file.
-        clock: of the robot.
-        receive: called on the thread with each picture and the time when it came.
+        clock: the robot's clock.
+        receive: called on this thread with each picture and the time of its arrival [s].
     """
 
     def __init__(self, name: str, clock: Clock, receive: Callable[[Picture, float], None]):
@@ -53,7 +53,7 @@ class Source(threading.Thread):
         self.error: Exception | None = None
 
     def run(self) -> None:
-        """Read until the source ends; open a live one again and again that broke after its first picture."""
+        """Read until the source ends; reopen a live source that breaks after its first picture."""
         while not self.stopped.is_set():
             try:
                 self._read()
@@ -90,7 +90,7 @@ class Source(threading.Thread):
         with video_io.open_reader(Path(self.source)) as video:
             size = video_geometry.square_size(video.width, video.height, video.pixel_aspect)
             start = None
-            for frame in video.frames(*size):  # at the pace at which it was recorded
+            for frame in video.frames(*size):  # at the rate at which they were recorded
                 start = self.clock.now() - frame.time if start is None else start
                 self.stopped.wait(self.clock.to_wall(start + frame.time - self.clock.now()))
                 yield np.ascontiguousarray(frame.picture)
@@ -100,13 +100,13 @@ class Eyes:
     """The newest pictures of both eyes, from one source or two; use it in a `with` block.
 
     Args:
-        sources: one, or that of the left and that of the right eye.
-        lenses: calibrated lenses, one for all sources or one for each; none for cameras with the eye's own lens.
-        eye: that the nervous system learned with.
-        clock: of the robot.
-        mono: a single source is one picture, which both eyes get; else it holds two side by side.
+        sources: one source, or those of the left and of the right eye.
+        lenses: calibrated lenses, one for all sources or one for each; empty for cameras with the eye's own lens.
+        eye: camera with which the nervous system was trained.
+        clock: the robot's clock.
+        mono: give the picture of a single source to both eyes; otherwise it holds two pictures side by side.
 
-    Raises InputError for sources without pictures, and pictures that do not fit.
+    Raises InputError for sources without pictures, and for pictures of a wrong size.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Eyes:
         self._resamplers: list[Resampler] = []
         self._taken = -1.0
         self._clock = clock
-        self._count = 0  # frames that were taken
+        self._count = 0  # frames taken so far
         self._sources = [
             Source(name, clock, lambda picture, time, index=index: self._receive(index, picture, time))
             for index, name in enumerate(sources)
@@ -147,14 +147,14 @@ class Eyes:
         for source in self._sources:
             source.stopped.set()
         for source in self._sources:
-            source.join(CLOSING)  # one that waits for its camera ends with the process
+            source.join(CLOSING)  # a thread that still waits for its camera ends with the process
 
     def seen(self) -> float:
-        """Return the share of the eyes' pictures that the cameras see."""
+        """Return the fraction of the eyes' pictures that the cameras see."""
         return float(np.mean([resampler.seen for resampler in self._resamplers]))
 
     def take(self, timeout: float) -> Frame | None:
-        """Return pictures that were not taken yet; None if none come within `timeout` [s]."""
+        """Return the newest pictures that were not taken yet; None if none arrive within `timeout` [s]."""
         with self._condition:
             if not self._condition.wait_for(self._has_new, self._clock.to_wall(timeout)):
                 return None
@@ -169,7 +169,7 @@ class Eyes:
             self._condition.notify()
 
     def _has_new(self) -> bool:
-        """Return whether every source has a picture that was not taken yet, and all are of the same time."""
+        """Return whether every source has a new picture and all arrived at about the same time."""
         times = [each[1] for each in self._newest if each is not None]
         close = bool(times) and max(times) - min(times) < PAIR_TOLERANCE * PERIOD
         return len(times) == len(self._newest) and min(times) > self._taken and close
@@ -196,7 +196,7 @@ class Eyes:
         for size, lens in zip(sizes, lenses, strict=True):
             if size != lens.size:
                 raise InputError(
-                    f"expected pictures of {lens.size[0]} x {lens.size[1]} px, as the camera was calibrated, got "
+                    f"expected pictures of {lens.size[0]} x {lens.size[1]} px, the size of the calibration, got "
                     f"{size[0]} x {size[1]}; set the camera to the calibrated size"
                 )
         return [resampling.from_lens(lens, self._eye) for lens in lenses]

@@ -1,8 +1,8 @@
-"""Calibrate a lens from pictures of a chessboard, with OpenCV, and see what is left of straight lines.
+"""Calibrate a lens with OpenCV from pictures of a chessboard, and measure how far its rows are from straight lines.
 
-The edges of a board are straight. Through a lens that is known, the corners of each row lie on a great circle of the
-viewing directions, whatever the lens bends: the angle between a corner and the circle through its row is what the
-calibration leaves. It needs no pose of the board, and so no part of the calibration that it judges.
+The rows of a board are straight. If the lens is known, the viewing directions of the corners in a row lie on a great
+circle, however much the lens bends the row. The angle between a corner and the circle through its row is the remaining
+error of the calibration. This measure uses the lens alone, and none of the board poses that the calibration estimates.
 """
 
 from collections.abc import Sequence
@@ -25,12 +25,12 @@ if lens.HAS_OPENCV:
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm")
 MIN_BOARDS = 5
 MAX_ERROR = 2.0  # px, root mean square, above which a calibration is refused
-MAGNIFICATION = 20  # of what is left of straight lines, in the figure
+MAGNIFICATION = 20  # of the distances from straight lines, in the figure
 
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A chessboard: inner corners along and across, and the side of a square."""
+    """A chessboard: numbers of inner corners along and across, and the side of a square."""
 
     columns: int
     rows: int
@@ -47,29 +47,31 @@ class Calibration:
     """A lens, and the corners that it was made from."""
 
     lens: Lens
-    error: float  # px, root mean square distance of corners from where the lens puts them
+    error: float  # px, root mean square distance between corners and their projections
     corners: Float[np.ndarray, "pictures rows columns 2"]  # px
     used: tuple[str, ...]  # names of pictures with the board
     unused: tuple[str, ...]
 
 
 def parse_board(text: str, square: float) -> Board:
-    """Return a board for a text such as 9x6; raise `InputError` for another."""
+    """Return the board that a text such as 9x6 describes; raise `InputError` for any other text."""
     words = text.lower().split("x")
     if len(words) != 2 or not all(word.isdecimal() and 3 <= int(word) <= 50 for word in words):
         raise InputError(f"expected --board as 9x6, inner corners along and across, got {one_line(text)[:40]}")
     columns, rows = map(int, words)
     if columns == rows:
-        raise InputError(f"expected a --board with unequal sides, since a square one looks alike turned, got {text}")
+        raise InputError(
+            f"expected a --board with unequal sides, since a square one looks the same when turned, got {text}"
+        )
     if not 0 < square < 1e4:
-        raise InputError(f"expected --square above 0 mm, got {square:g}; measure one")
+        raise InputError(f"expected --square above 0 mm, got {square:g}; measure a square")
     return Board(columns=columns, rows=rows, square=square)
 
 
 def calibrate(folder: Path, board: Board, model: Model) -> Calibration:
     """Calibrate a lens from the pictures in a folder.
 
-    Raises InputError for too few pictures with the whole board, for pictures of several sizes, and for a bad fit.
+    Raises InputError if too few pictures show the whole board, if their sizes differ, or if the fit is bad.
     """
     check_installed()
     pictures, size = _read_pictures(folder)
@@ -111,7 +113,7 @@ def _read_pictures(folder: Path) -> tuple[dict[str, UInt8[np.ndarray, "height wi
 
 
 def read_grey(path: Path) -> UInt8[np.ndarray, "height width"]:
-    """Read a picture; raise `InputError` for a file that is none."""
+    """Return a picture in grey levels; raise `InputError` for a file that is not a picture."""
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("L"))
@@ -122,7 +124,7 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "height width"]:
 
 
 def find_corners(picture: UInt8[np.ndarray, "height width"], board: Board) -> Float[np.ndarray, "corners 2"] | None:
-    """Return the inner corners of the board [px], row by row, to a fraction of a pixel; None if it is not whole."""
+    """Return the inner corners of the board [px], row by row, with subpixel accuracy; None if it is not all in view."""
     found, corners = cv2.findChessboardCornersSB(picture, (board.columns, board.rows), None, cv2.CALIB_CB_ACCURACY)
     return np.asarray(corners, float).reshape(-1, 2) if found else None
 
@@ -131,11 +133,11 @@ def _fit(
     corners: Sequence[Float[np.ndarray, "corners 2"]], board: Board, model: Model, size: tuple[int, int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the error [px], K and D that OpenCV fits to the corners."""
-    points = [board.points()[None].astype(np.float32)] * len(corners)  # OpenCV 5 wants rows of points
+    points = [board.points()[None].astype(np.float32)] * len(corners)  # OpenCV 5 expects rows of points
     seen = [each[None].astype(np.float32) for each in corners]
     try:
         if model == "fisheye":
-            names = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # before OpenCV 5, and since
+            names = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_SKEW") else cv2  # OpenCV 4, OpenCV 5
             flags = sum(getattr(names, name) for name in ("CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW"))
             points = [each.astype(np.float64) for each in points]
             seen = [each.astype(np.float64) for each in seen]
@@ -144,7 +146,8 @@ def _fit(
             error, K, D, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
     except cv2.error as fault:
         raise InputError(
-            f"expected boards that a {model} lens fits, got {one_line(fault)[:120]}; take the board from more sides"
+            f"expected boards that a {model} lens fits, got {one_line(fault)[:120]}; "
+            "photograph the board from more sides"
         ) from fault
     return float(error), np.asarray(K, float), np.asarray(D, float).reshape(-1)
 
@@ -161,7 +164,7 @@ def directions(calibrated: Lens, points: Float[np.ndarray, "n 2"]) -> Float[np.n
 
 
 def bends(calibration: Calibration) -> Float[np.ndarray, "pictures rows columns"]:
-    """Return how far each corner lies beside the straight line of its row [rad], positive on one side."""
+    """Return the angle between each corner and the straight line through its row [rad], positive on one side."""
     pictures, rows, columns, _ = calibration.corners.shape
     rays = directions(calibration.lens, calibration.corners.reshape(-1, 2)).reshape(pictures, rows, columns, 3)
     _, _, axes = np.linalg.svd(rays)
@@ -171,7 +174,7 @@ def bends(calibration: Calibration) -> Float[np.ndarray, "pictures rows columns"
 
 @style.styled
 def plot(calibration: Calibration) -> Figure:
-    """Plot the rows of all boards as seen, and each corner's distance from its row's straight line, magnified."""
+    """Plot the rows of all boards as seen, and the magnified distance of each corner from its row's straight line."""
     left = bends(calibration)
     figure = Figure(figsize=(style.WIDTH, 3.6))
     picture, histogram = figure.subplots(1, 2, width_ratios=(1.6, 1))
@@ -187,15 +190,15 @@ def plot(calibration: Calibration) -> Figure:
             *(corners + MAGNIFICATION * focal * residuals[:, None] * across).T, color=style.LEFT_COLOUR, linewidth=0.8
         )
     picture.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="column [px]", ylabel="row [px]")
-    picture.set_title(f"rows as seen, and what bends them still, {MAGNIFICATION} times")
+    picture.set_title(f"rows as seen, and their remaining bend, {MAGNIFICATION} times")
     histogram.hist(np.rad2deg(left).ravel(), bins=40, color=style.LEFT_COLOUR)
-    histogram.set(xlabel="angle beside the straight line [deg]", ylabel="corners")
+    histogram.set(xlabel="angle from the straight line [deg]", ylabel="corners")
     histogram.set_title(f"{calibration.error:.2f} px root mean square")
     return figure
 
 
 def check_installed() -> None:
-    """Raise `InputError` where OpenCV is missing."""
+    """Raise `InputError` if OpenCV is missing."""
     if not lens.HAS_OPENCV:
         raise InputError(
             "expected OpenCV to find a chessboard, got an environment without it; pip install 'lgmdjax[drive]'"

@@ -1,4 +1,4 @@
-"""A clock for the robot's time, which may run slower than the wall's."""
+"""A clock of the robot's time, which may run slower than wall-clock time."""
 
 import time
 
@@ -8,13 +8,13 @@ MIN_SPEED, MAX_SPEED = 0.01, 1.0
 
 
 class Clock:
-    """Seconds of the robot's time since it was made.
+    """The robot's time since the clock was made.
 
-    A slow clock gives a computer that is busy with a simulated robot the time that it needs: both processes then take
-    the same `speed`. A real robot has speed 1.
+    A slow clock helps a computer that cannot simulate the robot in real time: both processes then use the same
+    `speed`. A real robot needs speed 1.
 
     Args:
-        speed: seconds of the robot for each second of the wall.
+        speed: seconds of the robot's time for each second of wall-clock time.
     """
 
     def __init__(self, speed: float = 1.0):
@@ -24,9 +24,9 @@ class Clock:
         self._start = time.monotonic()
 
     def now(self) -> float:
-        """Return the time [s]."""
+        """Return the robot's time [s]."""
         return (time.monotonic() - self._start) * self.speed
 
     def to_wall(self, duration: float) -> float:
-        """Return how long a duration of the robot [s] takes on the wall [s]; not negative, as timeouts need it."""
+        """Return the wall-clock duration [s] of a duration of the robot's time [s]; at least 0, as timeouts require."""
         return max(duration, 0.0) / self.speed

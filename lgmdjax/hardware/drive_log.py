@@ -1,4 +1,4 @@
-"""The log of a drive on disk: Parquet, a row for each step of the servos' loop, with units in every file.
+"""The log of a drive: Parquet files with one row for each step of the servo loop, and units in every file.
 
 | column                            | unit    | what                                                        |
 | --------------------------------- | ------- | ----------------------------------------------------------- |
@@ -12,8 +12,8 @@
 | voltage                           | V       | median over the servos                                      |
 | bus_failures, stops               | -       | answers missed so far, requests to stop                     |
 
-Joints are in the order of `joint_map.JOINT_NAMES`. Rows are written in chunks of `CHUNK_ROWS`, each a file that gets
-its name when it is complete: a process that is killed loses the present chunk alone.
+Joints are in the order of `joint_map.JOINT_NAMES`. Rows are written in chunks of `CHUNK_ROWS`. The
+file of a chunk gets its final name when it is complete, so a process that is killed loses only its last chunk.
 """
 
 import json
@@ -52,7 +52,7 @@ class Writer:
     """Writes rows into a folder of its own; use it in a `with` block.
 
     Args:
-        folder: made if need be; it must have no log yet.
+        folder: created if it is missing; it must be empty.
         facts: JSON values for the header.
     """
 
@@ -74,16 +74,16 @@ class Writer:
         self.flush()
         self._thread.shutdown()
         for written in self._written:
-            written.result()  # raises what the thread did
+            written.result()  # raises the exception of the thread, if any
 
     def add(self, row: Row) -> None:
-        """Add a row; a full chunk is written on a thread of its own, since a robot does not wait for a disk."""
+        """Add a row; a full chunk is written on another thread, so that the robot does not wait for the disk."""
         self._rows.append(row)
         if len(self._rows) >= CHUNK_ROWS:
             self.flush()
 
     def flush(self) -> None:
-        """Begin to write the rows that are not written yet."""
+        """Start to write the rows that are not written yet."""
         if self._rows:
             path = self.folder / f"drive-{self._chunks:05d}.parquet"
             self._written.append(self._thread.submit(_write, path, self._rows, self._metadata))
@@ -124,6 +124,6 @@ def read(folder: Path) -> pa.Table:
 
 
 def joints(table: pa.Table, name: str) -> np.ndarray:
-    """Return the columns of a quantity of all joints, (rows, 18); nan where it was not known."""
+    """Return a quantity of all joints, (rows, 18); NaN where it is unknown."""
     columns = [table[f"{name}_{joint}"].cast(pa.float64()).to_numpy() for joint in range(JOINTS)]
     return np.stack(columns, axis=1)

@@ -1,9 +1,9 @@
 """The loop that drives a robot: pictures in, set points out, with the supervisor between them.
 
-Each step of the loop, at the gait's rate and whenever pictures come, does the same: take the pictures and run the
-nervous system on them, ask the supervisor for the mode, send the set points of the mode within the limits, ask one
-servo for its status, and log. For each frame the nervous system gives the set points of `SUBSTEPS` steps; if the next
-frame is late, the last ones are held.
+The loop makes a step at the rate of the gait, and whenever pictures arrive. Each step runs the nervous system on new
+pictures, lets the supervisor choose the mode, and sends the set points of that mode within the limits. At the rate of
+the gait it also reads the status of one servo and logs a row. For each frame the nervous system returns the set points
+of `SUBSTEPS` steps; if the next frame is late, the last set points are held.
 """
 
 import math
@@ -28,9 +28,9 @@ from lgmdjax.hardware.supervisor import Mode, Senses
 from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS
 
 STEP = 1 / (FRAME_RATE * SUBSTEPS)  # s
-SLOW_MODES = {Mode.RISE: -1, Mode.STAND: -1, Mode.SIT: 0}  # and the posture that they move to
+SLOW_MODES = {Mode.RISE: -1, Mode.STAND: -1, Mode.SIT: 0}  # and the index of the posture that they move to
 NO_FAULT = Fault(0)
-LATE = 1.5  # frame periods between two pictures, from which on one was missed
+LATE = 1.5  # frame periods between two pictures; if it is more, a frame was missed
 
 
 class Brain:
@@ -44,7 +44,7 @@ class Brain:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all pictures."""
+        """Return to the state before the first picture."""
         self._state = nervous_system.init(self.params)
 
     def __call__(self, pictures: np.ndarray) -> nervous_system.Output:
@@ -55,7 +55,7 @@ class Brain:
 
 @dataclass
 class Readings:
-    """What the servos said last, by joint."""
+    """The last readings of the servos, by joint."""
 
     angles: Float[np.ndarray, "6 3"]
     loads: list[float | None] = field(default_factory=lambda: [None] * 18)
@@ -64,21 +64,21 @@ class Readings:
     faults: Fault = NO_FAULT
 
     def take(self, servos: JointMap, joint: int, status: Status) -> None:
-        """Take what a servo said."""
+        """Store the status of a servo."""
         turn = int(servos.directions[joint])
         self.angles.reshape(18)[joint] = joint_map.to_angle(servos, joint, status.position)
         self.loads[joint], self.temperatures[joint] = turn * status.load, status.temperature
         self.voltages[joint], self.faults = status.voltage, self.faults | status.faults
 
     def voltage(self) -> float | None:
-        """Return the median over the servos [V], since one may measure badly; 0 if one says that it is out of range."""
+        """Return the median voltage of the servos [V], as one may measure badly; 0 if one reports it out of range."""
         if self.faults & Fault.VOLTAGE:
             return 0.0
         known = [value for value in self.voltages if value is not None]
         return statistics.median(known) if known else None
 
     def temperature(self) -> float | None:
-        """Return the highest temperature [degrees Celsius]; that of a servo which says that it is too hot counts."""
+        """Return the highest temperature [degrees Celsius]; infinite if a servo reports that it is too hot."""
         known = [value for value in self.temperatures if value is not None]
         hottest = max(known, default=None)
         return math.inf if self.faults & Fault.OVERHEATING else hottest
@@ -86,15 +86,15 @@ class Readings:
 
 @dataclass
 class Timing:
-    """Times between frames and set points, on the wall."""
+    """Delays from frames to their set points, in wall-clock time, and the number of missed frames."""
 
     latencies: list[float] = field(default_factory=list)  # s
     missed: int = 0
 
     def describe(self) -> str:
-        """Return a line about them."""
+        """Return a summary of one line."""
         if not self.latencies:
-            return "no frame was walked on"
+            return "no frame was used for walking"
         median, late = np.percentile(self.latencies, [50, 99]) * 1000
         frames = len(self.latencies)
         counts = f"{frames} frames, {self.missed} missed"
@@ -103,7 +103,7 @@ class Timing:
 
 @dataclass(kw_only=True)
 class Driver:
-    """A robot that is driven: its parts, which are open, and its state."""
+    """A robot that is driven: its open devices, and its state."""
 
     brain: Brain
     eyes: Eyes
@@ -112,7 +112,7 @@ class Driver:
     clock: Clock
     log: drive_log.Writer
     stops: Callable[[], int]  # requests to stop so far
-    tell: Callable[[str], None]  # a line for the user
+    tell: Callable[[str], None]  # prints a line for the user
     params: supervisor.Params
     inertial: InertialSensor | None = None
     seconds: float = math.inf  # of walking
@@ -124,8 +124,8 @@ class Driver:
         self.setpoints = self.readings.angles.copy()
         self._output: nervous_system.Output | None = None
         self._frame: Frame | None = None
-        self._walked_on: float | None = None  # time of the frame that the output belongs to
-        self.holding: list[int] = []  # servos that did not say that they let go
+        self._walked_on: float | None = None  # time of the frame that the output is for
+        self.holding: list[int] = []  # servos that did not confirm that their torque is off
         self._walk_ends, self._next_joint = math.inf, 0
         self._last, self._due = self.clock.now(), self.clock.now()
 
@@ -144,7 +144,7 @@ class Driver:
         return self.state
 
     def _read_all(self) -> Float[np.ndarray, "6 3"]:
-        """Return where the legs are; raise `BusLost` if a servo does not say it."""
+        """Return the joint angles [rad]; raise `BusLost` if a servo does not answer."""
         found = [self._read_patiently(servo) for servo in self.servos.ids]
         return joint_map.to_angles(self.servos, np.array(found))
 
@@ -155,7 +155,7 @@ class Driver:
         raise BusLost(f"servo {servo} does not answer")
 
     def _step(self) -> None:
-        """Wait for pictures or for the next step of the gait; then do all that is to be done."""
+        """Wait for pictures or for the next step of the gait, then make a step of the loop."""
         frame = self.eyes.take(self._due - self.clock.now())
         now = self.clock.now()
         if frame is not None:
@@ -210,7 +210,7 @@ class Driver:
 
     def _send(self, now: float) -> None:
         """Send the set points of the mode, within the limits."""
-        elapsed, self._last = min(now - self._last, 3 * STEP), now  # a pause makes no jump
+        elapsed, self._last = min(now - self._last, 3 * STEP), now  # no jump after a pause
         target = SLOW_MODES.get(self.state.mode)
         limits = self.servos.limits()
         if target is not None:
@@ -228,7 +228,7 @@ class Driver:
         )
 
     def _targets(self, now: float) -> Float[np.ndarray, "6 3"]:
-        """Return the set points of the nervous system for now; the present ones before its first frame."""
+        """Return the nervous system's set points for the present time; before its first frame, the last ones sent."""
         if self._output is None or self._walked_on is None:
             return self.setpoints
         return np.asarray(self._output.targets[min(int((now - self._walked_on) / STEP), SUBSTEPS - 1)], float)
@@ -236,7 +236,7 @@ class Driver:
     def _ask_one_servo(self) -> None:
         joint, self._next_joint = self._next_joint, (self._next_joint + 1) % len(self.servos.ids)
         if self.state.mode is Mode.SIT:
-            return  # a bus that waits for answers would make the motion jerk
+            return  # waiting for answers would make the motion jerky
         if (status := self.bus.read_status(self.servos.ids[joint])) is not None:
             self.readings.take(self.servos, joint, status)
 
@@ -264,7 +264,7 @@ class Driver:
         self.log.add(row)
 
     def _sit_blindly(self) -> None:
-        """Lower the robot without looking at anything, after an error of this program."""
+        """Lower the robot without reading any sensor, after an error in this program."""
         end = self.clock.now() + self.params.sit_timeout
         try:
             while self.clock.now() < end and self.stops() < 2 and not postures.has_reached(0, self.setpoints):

@@ -2,13 +2,13 @@
 
 | name           | what happens                                                                     |
 | -------------- | -------------------------------------------------------------------------------- |
-| bus-cut        | the data wire is cut: no servo hears or answers, each holds its last goal         |
-| unplugged      | the adapter is pulled: the port is gone                                          |
-| frames-stopped | no picture comes any more; the connection stays                                  |
-| corrupt        | one byte in 300 is another, both ways                                            |
-| garbled        | one byte in 20 is another, both ways                                             |
-| dead-servo     | a knee has no torque and does not answer                                         |
-| hot-servo      | a knee gets warmer by 4 degrees a second                                         |
+| bus-cut        | the data wire is cut: no servo receives or answers, each holds its last goal     |
+| unplugged      | the adapter is unplugged: the port is gone                                       |
+| frames-stopped | no more pictures are sent; the connection stays open                             |
+| corrupt        | one byte in 300 is replaced, in both directions                                  |
+| garbled        | one byte in 20 is replaced, in both directions                                   |
+| dead-servo     | the servo of a femur has no torque and does not answer                           |
+| hot-servo      | the servo of a femur gets warmer by 4 degrees a second                           |
 | low-voltage    | the battery gives 9 V                                                            |
 | fall           | the robot lies on its back                                                       |
 """
@@ -36,14 +36,14 @@ Fault = Literal[
 ]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 VICTIM = 4  # index of the joint whose servo dies or gets hot: the left middle femur
-COLD, HEATING, WARM = 36.0, 4.0, 60.0  # degrees Celsius, degrees Celsius/s, and where it begins
+COLD, HEATING, WARM = 36.0, 4.0, 60.0  # degrees Celsius, degrees Celsius/s, and degrees Celsius at the start of heating
 CHARGED, EMPTY = 111, 90  # 0.1 V
 SHARES = {"corrupt": 1 / 300, "garbled": 1 / 20}  # of bytes
 
 
 @dataclass
 class Faults:
-    """The faults that are on, and since when."""
+    """The active faults, and since when each is active."""
 
     active: dict[str, float] = field(default_factory=dict)  # s
     _time: float = 0.0
@@ -52,7 +52,7 @@ class Faults:
 
     @property
     def bus_cut(self) -> bool:
-        """Whether bytes get lost."""
+        """Whether all bytes of the bus are lost."""
         return "bus-cut" in self.active
 
     @property
@@ -66,7 +66,7 @@ class Faults:
         return "frames-stopped" in self.active
 
     def obey(self, line: str) -> str:
-        """Switch the fault of a line on, or all off for "clear"; return a line for the user."""
+        """Switch on the fault that a line names, or switch all off for "clear"; return a line for the user."""
         word = line.strip()
         if word == "clear":
             self.active.clear()
@@ -77,7 +77,7 @@ class Faults:
         return f"fault: {word}"
 
     def act(self, body: Body, bank: Bank, time: float) -> None:
-        """Do what the faults do to body and servos."""
+        """Apply the active faults to body and servos."""
         self._time = time
         servo = list(bank.servos.values())[VICTIM]
         servo.dead = "dead-servo" in self.active
@@ -92,7 +92,7 @@ class Faults:
         self._fallen = "fall" in self.active
 
     def garble(self, content: bytes) -> bytes:
-        """Return bytes of the bus as they arrive."""
+        """Return bytes of the bus as they arrive, some of them replaced."""
         share = max((SHARES.get(name, 0.0) for name in self.active), default=0.0)
         if not share:
             return content

@@ -1,4 +1,4 @@
-"""An inertial sensor on a serial port: one line of three numbers for each sample, and whether the robot fell.
+"""Detect a fall with an inertial sensor on a serial port, which sends a line of three numbers for each sample.
 
 A line holds the acceleration in the trunk's frame (x forward, y left, z up), separated by blanks or commas, in any
 unit: only its direction matters. At rest, upright, it is (0, 0, +1). Lines that are not three numbers are ignored.
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from lgmdjax.body import hexapod
 from lgmdjax.errors import InputError
 
-SMOOTHING = 0.3  # s, of the acceleration: steps shake the trunk
+SMOOTHING = 0.3  # s, time constant for the acceleration, since steps shake the trunk
 MAX_LINE = 200  # bytes
 
 
@@ -26,7 +26,7 @@ class InertialSensor:
     def __init__(self, port: str):
         try:
             self._file = os.open(port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-            with contextlib.suppress(termios.error):  # a pipe is no terminal
+            with contextlib.suppress(termios.error):  # a pipe is not a terminal
                 tty.setraw(self._file)
         except OSError as error:
             raise InputError(f"expected an inertial sensor, got {port} ({error.strerror}); check it") from error
@@ -40,12 +40,12 @@ class InertialSensor:
         os.close(self._file)
 
     def has_fallen(self, time: float) -> bool:
-        """Read what came, and return whether the trunk is tilted as far as that of a robot that fell.
+        """Read new samples; return whether the trunk is tilted so far that the robot must have fallen.
 
         Args:
-            time: now [s].
+            time: present time [s].
         """
-        with contextlib.suppress(OSError):  # nothing new, or the plug is pulled
+        with contextlib.suppress(OSError):  # nothing new, or the sensor was unplugged
             self._bytes += os.read(self._file, 4096)
         *lines, self._bytes = self._bytes[-4096:].split(b"\n")
         self._bytes = self._bytes[-MAX_LINE:]

@@ -1,4 +1,4 @@
-"""Which servo is which joint, and how far, how fast and how strongly it may move: a TOML file.
+"""The joint map, a TOML file: which servo moves which joint, and the limits of angle, speed, torque and others.
 
 ```toml
 baud = 1000000        # bit/s
@@ -7,7 +7,7 @@ baud = 1000000        # bit/s
 speed = 5.0           # rad/s
 torque = 0.8          # of the stall torque
 voltage = 9.6         # V, below which the robot sits down
-temperature = 70.0    # degrees Celsius, from which on it sits down
+temperature = 70.0    # degrees Celsius, at which it sits down
 
 [joints.left_front_coxa]
 id = 1
@@ -17,9 +17,10 @@ lowest = -75.0        # deg
 highest = 75.0        # deg
 ```
 
-and so on for all eighteen joints, named <leg>_<joint> as in `hexapod.LEGS` and `hexapod.JOINTS`. At zero a leg is
-straight out along its mount, the femur level and the tibia plumb; positive coxa turns to the left, positive femur and
-tibia lift. Limits of an angle may be narrower than those of the gait's model, not wider.
+and so on for all eighteen joints, named <leg>_<joint> as in `hexapod.LEGS` and `hexapod.JOINTS`. At zero a leg
+points straight out along its mount, with the femur level and the tibia vertical. A positive coxa angle turns to the
+left; positive femur and tibia angles lift. The limits of an angle may be narrower than those of the robot's model, but
+not wider.
 """
 
 import tomllib
@@ -85,7 +86,7 @@ class JointMap:
 
 
 def default() -> JointMap:
-    """Return the map of a robot whose servos are numbered as its joints, all mounted alike."""
+    """Return the map of a robot whose servo ids 1 to 18 follow the order of its joints, all mounted the same way."""
     lowest, highest = hexapod.target_limits().reshape(2, 18)
     return JointMap(
         ids=tuple(range(1, 19)),
@@ -97,7 +98,7 @@ def default() -> JointMap:
 
 
 def to_positions(servos: JointMap, angles: Float[np.ndarray, "6 3"]) -> list[int]:
-    """Return the servos' positions for joint angles [rad], cut off at the ends of the servos' range.
+    """Return the servos' positions for joint angles [rad], limited to the servos' range.
 
     >>> to_positions(default(), np.full((6, 3), 0.1))[0]
     532
@@ -117,7 +118,7 @@ def to_angles(servos: JointMap, positions: Int[np.ndarray, "18"]) -> Float[np.nd
 
 
 def read(path: Path) -> JointMap:
-    """Read a map; raise `InputError` for a file that is missing, wrong, or has two joints with one servo."""
+    """Return the map in a file; raise `InputError` if it is missing or wrong, or if two joints have one servo."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -157,7 +158,7 @@ def to_toml(servos: JointMap) -> str:
         f"speed = {servos.speed}  # rad/s",
         f"torque = {servos.torque}  # of the stall torque",
         f"voltage = {servos.voltage}  # V, below which the robot sits down",
-        f"temperature = {servos.temperature}  # degrees Celsius, from which on it sits down",
+        f"temperature = {servos.temperature}  # degrees Celsius, at which it sits down",
     ]
     lowest, highest = (np.rad2deg(values).round(3).tolist() for values in (servos.lowest, servos.highest))
     for joint, name in enumerate(JOINT_NAMES):
@@ -174,12 +175,14 @@ def to_toml(servos: JointMap) -> str:
 
 
 def _check(servos: JointMap, path: Path) -> None:
-    """Raise `InputError` for what a schema cannot say."""
+    """Raise `InputError` for errors that a schema cannot express."""
     for joint, name in enumerate(JOINT_NAMES):
         place = f"{path}: joints.{name}"
         if servos.ids[joint] in servos.ids[:joint]:
             other = JOINT_NAMES[servos.ids.index(servos.ids[joint])]
-            raise InputError(f"{place}.id: expected another servo than {other} has, got {servos.ids[joint]}; {REMEDY}")
+            raise InputError(
+                f"{place}.id: expected an id that {other} does not have, got {servos.ids[joint]}; {REMEDY}"
+            )
         if servos.directions[joint] == 0:
             raise InputError(f"{place}.direction: expected 1 or -1, got 0; {REMEDY}")
         low, high = hexapod.target_limits().reshape(2, 18)[:, joint]

@@ -1,4 +1,4 @@
-"""Calibrated lenses: OpenCV's fisheye and pinhole models, and the file that holds one.
+"""Calibrated lenses: OpenCV's fisheye and pinhole models, and their file format.
 
 | symbol | name                                            | unit | shape            |
 | ------ | ----------------------------------------------- | ---- | ---------------- |
@@ -8,10 +8,10 @@
 | r      | distance from the axis in the plane at distance 1 | 1  | -                |
 
 Fisheye: theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8). Pinhole: r (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 +
-...), and the tangential terms p1, p2. Where such a polynomial falls again, it says nothing of the lens: rays beyond are
-not seen.
+...), and the tangential terms p1, p2. Beyond the angle at which such a polynomial starts to fall, it does not describe
+the lens, and rays count as not seen.
 
-A file is JSON, or YAML as OpenCV writes it, with `model` ("fisheye" or "pinhole"), `size` [width, height], `K` and `D`.
+A file is JSON, or YAML in OpenCV's form, with `model` ("fisheye" or "pinhole"), `size` [width, height], `K` and `D`.
 The longer names of OpenCV's tools and of ROS (`camera_matrix`, `distortion_coefficients`, `image_width`) are read too.
 
 Source: OpenCV's documentation of `calib3d` and of `fisheye`.
@@ -58,11 +58,11 @@ class Lens:
 def project(
     lens: Lens, directions: Float[np.ndarray, "3 *n"]
 ) -> tuple[Float[np.ndarray, "2 *n"], Bool[np.ndarray, "*n"]]:
-    """Return where the lens pictures rays, column and row [px] from the middle of the first pixel, and which it sees.
+    """Return the image points of rays, column and row [px] from the centre of the first pixel, and which it sees.
 
     Args:
-        lens: of the camera.
-        directions: of the rays, x to the right, y down, z ahead.
+        lens: the camera's lens.
+        directions: directions of the rays, x to the right, y down, z ahead.
     """
     x, y, z = directions
     across = np.hypot(x, y)
@@ -111,7 +111,7 @@ def _pinhole(
 
 
 def _first_fall(grid: np.ndarray, slope: np.ndarray) -> float:
-    """Return the angle at which a slope is no longer positive."""
+    """Return the first angle at which a slope is not positive; the last angle if it always is."""
     falls = np.flatnonzero(slope <= 0)
     return float(grid[falls[0]]) if len(falls) else float(grid[-1])
 
@@ -137,7 +137,7 @@ def write(path: Path, lens: Lens) -> None:
 
 
 def read(path: Path) -> Lens:
-    """Read a lens; raise `InputError` for a file that is missing, or is none."""
+    """Return the lens in a file; raise `InputError` if it is missing or is not a calibration."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -179,18 +179,18 @@ def _parse(path: Path, text: str) -> Mapping[str, object]:
 
 def _parse_yaml(path: Path, text: str) -> Mapping[str, object]:
     if not HAS_OPENCV:
-        raise InputError(f"{path}: expected JSON, or OpenCV to read YAML with; pip install 'lgmdjax[drive]'")
+        raise InputError(f"{path}: expected JSON, or YAML and OpenCV to read it; pip install 'lgmdjax[drive]'")
     header = "" if text.startswith("%YAML") else "%YAML:1.0\n---\n"
     try:
         file = cv2.FileStorage(header + text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = file.root()
-        return {name: _from_node(root.getNode(name)) for name in root.keys()}  # noqa: SIM118 (no mapping)
+        return {name: _from_node(root.getNode(name)) for name in root.keys()}  # noqa: SIM118 (not a mapping)
     except cv2.error as error:
         raise InputError(f"{path}: expected JSON or YAML, got {one_line(error)[:120]}; {REMEDY}") from error
 
 
 def _from_node(node: "cv2.FileNode") -> object:
-    """Return the value of a node of OpenCV's files; that of a matrix is an array."""
+    """Return the value of a node in an OpenCV file; for a matrix, the list of its numbers."""
     if node.isMap():
         names = node.keys()
         if "data" in names:
@@ -206,7 +206,7 @@ def _find(content: Mapping[str, object], *names: str) -> object:
 
 
 def _array(value: object) -> Float[np.ndarray, "..."] | None:
-    """Return the numbers of a field, which may be a matrix as OpenCV's JSON or ROS writes one; None if it is none."""
+    """Return the numbers of a field, which may be a matrix as in OpenCV's JSON or in ROS; None if it has none."""
     numbers = value.get("data") if isinstance(value, Mapping) else value
     try:
         array = np.asarray(numbers, float)

@@ -1,13 +1,13 @@
-"""Open cameras that go on: a device of the kernel, a stream of the network, or a pipe.
+"""Open live cameras: a kernel device, a network stream, or a pipe.
 
 | source                                  | read by                                     |
 | --------------------------------------- | ------------------------------------------- |
 | `/dev/video0`                           | FFmpeg's v4l2                               |
-| `rtsp://`, `http://`, `tcp://`, `udp://`, ... | FFmpeg, with the protocols of `PROTOCOLS` alone |
-| a pipe, `/dev/stdin`                    | FFmpeg, which sees its bytes alone          |
+| `rtsp://`, `http://`, `tcp://`, `udp://`, ... | FFmpeg, only with the protocols in `PROTOCOLS` |
+| a pipe, `/dev/stdin`                    | FFmpeg, which gets only the bytes           |
 
-Anything else is a file (`reporting.video_source`). Nothing is buffered beyond one picture: an old picture is worth
-nothing to a robot. Formats that only name other files (playlists) are refused, as for files.
+Anything else is a file (`reporting.video_source`). Only one picture is buffered, since old pictures are
+useless to a robot. Formats that only name other files (playlists) are refused, as they are for files.
 """
 
 import contextlib
@@ -33,12 +33,12 @@ from lgmdjax.reporting import video_geometry, video_io, video_source
 PROTOCOLS = ("tcp", "udp", "rtp", "rtsp", "rtsps", "http", "https", "srt", "rtmp")
 WHITELIST = ",".join((*PROTOCOLS, "tls", "crypto", "httpproxy"))
 FORMATS = ",".join((*video_source.VIDEO_FORMATS, "rtsp", "rtp", "sdp", "mpjpeg", "live_flv"))
-PATIENCE = 10.0  # s, for a source that opens, and for each of its pictures
+PATIENCE = 10.0  # s, to wait for a source to open, and for each of its pictures
 PROMPT = {"fflags": "nobuffer", "flags": "low_delay", "probesize": "5000000", "analyzeduration": "500000"}
 
 
 def is_live(source: str) -> bool:
-    """Return whether a source is a device or a stream of the network; a pipe may hold a file."""
+    """Return whether a source is a device or a network stream; a pipe does not count, since it may carry a file."""
     return is_stream(source) or is_device(source)
 
 
@@ -49,7 +49,7 @@ def is_stream(source: str) -> bool:
 
 
 def is_device(source: str) -> bool:
-    """Return whether a source is a camera of the kernel."""
+    """Return whether a source is a camera device of the kernel."""
     try:
         return stat.S_ISCHR(os.stat(source).st_mode) and Path(source).resolve().name.startswith("video")
     except (OSError, ValueError):
@@ -57,7 +57,7 @@ def is_device(source: str) -> bool:
 
 
 def without_login(source: str) -> str:
-    """Return a source without the name and the password that its address may hold.
+    """Return a source without the user name and the password that its address may contain.
 
     >>> without_login("rtsp://me:secret@camera/left")
     'rtsp://camera/left'
@@ -80,10 +80,10 @@ def open_live(source: str, *, rate: int | None = None, patience: float = PATIENC
 
     Args:
         source: device, address or pipe.
-        rate: that a device is asked for [frames/s]; its own if None.
-        patience: how long to wait for it to open, and for each picture [s of the wall].
+        rate: frame rate to request from a device [frames/s]; its own if None.
+        patience: longest wait for it to open, and for each picture [s of wall-clock time].
 
-    Raises InputError if there is none, or none with pictures.
+    Raises InputError if it does not open or sends no pictures.
     """
     with contextlib.ExitStack() as stack:
         try:
@@ -91,8 +91,8 @@ def open_live(source: str, *, rate: int | None = None, patience: float = PATIENC
         except (FFmpegError, OSError, ValueError) as error:
             name, reason = without_login(source), video_source.reason(error)
             raise InputError(
-                f"expected a camera, got {name}, which does not open ({reason}); check name, cable and rights, or try "
-                "to play it with ffplay"
+                f"expected a camera, got {name}, which does not open ({reason}); check name, cable and permissions, or "
+                "try to play it with ffplay"
             ) from error
         yield stack.enter_context(container)
 
@@ -110,7 +110,7 @@ def _open(source: str, rate: int | None, patience: float, stack: contextlib.Exit
 
 
 def decode_grey(source: str, container: InputContainer) -> Iterator[UInt8[np.ndarray, "height width"]]:
-    """Yield the pictures of a live source as they come, in grey and in their own size; damaged ones are left out."""
+    """Yield the pictures of a live source as they arrive, in grey and in their own size; damaged ones are left out."""
     stream = video_source.choose_stream(Path(source), container)
     stream.thread_type = "NONE"  # threads would hold back one picture each
     reformatter = VideoReformatter()
@@ -131,7 +131,7 @@ def _to_grey(reformatter: VideoReformatter, frame: av.VideoFrame) -> UInt8[np.nd
 
 @contextlib.contextmanager
 def open_reader(source: str, seconds: float) -> Iterator[video_io.Video]:
-    """Open a live source to read it for some seconds, by the times of its pictures, as `video_io.open_reader` does.
+    """Open a live source as `video_io.open_reader` opens a file, for some seconds by the times of its pictures.
 
     Raises InputError if it does not open or is no video.
     """
@@ -160,7 +160,7 @@ def open_reader(source: str, seconds: float) -> Iterator[video_io.Video]:
 
 
 def _decode_whole(packet: av.Packet) -> list[av.VideoFrame]:
-    """Return the frames of a packet that are whole."""
+    """Return the undamaged frames of a packet."""
     try:
         return [frame for frame in packet.decode() if isinstance(frame, av.VideoFrame) and not frame.is_corrupt]
     except FFmpegError as error:

@@ -1,10 +1,10 @@
 """Slow motions between sitting and standing, and the limits that hold for every motion.
 
-Postures are joint angles for feet on the floor and a trunk at some height above them: `POSTURES` of them in a row, from
-the trunk on the floor to the gait's height, where the feet are at their neutral places. Below it they are further out,
-since legs cannot fold enough to sit between their feet. So a robot is raised and lowered straight. The legs of a robot
-that was just switched on are somewhere else: they first move to the posture that is nearest to them, and then along the
-row.
+A posture is the joint angles for feet on the floor and a trunk at some height above them. `row` has `POSTURES` of them,
+from the trunk on the floor to the height of the gait, at which the feet are at their neutral positions. At lower
+heights the feet are farther out, since the legs cannot fold enough to sit between them. The trunk moves vertically
+along the row. When a robot is switched on, its legs may be anywhere: they first move to the nearest posture, and then
+along the row.
 """
 
 from functools import cache
@@ -17,12 +17,12 @@ from jaxtyping import Float
 from lgmdjax.body import hexapod
 from lgmdjax.locomotion import kinematics, tripod_gait
 
-SITTING_HEIGHT = 0.022  # m, of the trunk's centre above the feet's; its shell is on the floor
-SITTING_REACH = 0.06  # m, of the feet beyond their neutral places
+SITTING_HEIGHT = 0.022  # m, of the trunk's centre above the feet's centres; its shell is then on the floor
+SITTING_REACH = 0.06  # m, of the feet beyond their neutral positions
 POSTURES = 60
 SLOW = 0.8  # rad/s, of the fastest joint in a slow motion
 RAMP = 1.0  # s in which the speed of a walk grows to its limit
-TOLERANCE = 0.02  # rad, between a set point and a posture that is reached
+TOLERANCE = 0.02  # rad, largest difference from a posture that counts as reached
 
 Angles = Float[np.ndarray, "6 3"]
 
@@ -58,7 +58,7 @@ def toward(target: int, angles: Angles, max_change: float) -> Angles:
     Args:
         target: index of the posture, 0 for sitting and -1 for standing.
         angles: present set points [rad].
-        max_change: of a joint [rad].
+        max_change: largest change of a joint [rad].
     """
     postures = row()
     target %= POSTURES
@@ -70,7 +70,7 @@ def toward(target: int, angles: Angles, max_change: float) -> Angles:
 
 
 def has_reached(target: int, angles: Angles) -> bool:
-    """Return whether set points are those of a posture of the row."""
+    """Return whether set points are within `TOLERANCE` of a posture of the row."""
     return bool(np.abs(row()[target] - angles).max() <= TOLERANCE)
 
 

@@ -1,9 +1,9 @@
-"""Pictures of a real camera as the eye would have them that the network learned with.
+"""Resample pictures of a real camera to the eye with which the network was trained.
 
-Each pixel of the eye, an equidistant fisheye, is the mean of the camera's picture over the pixel's solid angle: rays
-are cast through a grid of points in the pixel, closer to each other than the camera's pixels are, and each ray reads
-the camera's picture between its four nearest pixels. All of it is linear in the picture, and so one sparse matrix, made
-once. Parts of the eye that the camera does not see have a constant grey, so that nothing moves in them.
+Each pixel of the eye, an equidistant fisheye, is the mean of the camera's picture over the pixel's solid angle. Rays
+are cast through a grid of points in the pixel, which is finer than the camera's pixels, and each ray interpolates the
+picture between its four nearest pixels. The result is linear in the picture: one sparse matrix, which is computed once.
+Parts of the eye that the camera does not see have a constant grey, so that nothing moves there.
 """
 
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ from lgmdjax.hardware import lens
 from lgmdjax.hardware.lens import Lens
 from lgmdjax.sensors import camera
 
-GREY = 128.0  # of what the camera does not see
+GREY = 128.0  # of pixels that the camera does not see
 MAX_RAYS = 12  # along each side of a pixel
-MIN_SEEN = 0.25  # of the eye's picture
+MIN_SEEN = 0.25  # fraction of the eye's picture
 
 
 @dataclass(frozen=True)
 class Resampler:
-    """The matrix from the camera's pixels to the eye's, and what is added for those that the camera does not see."""
+    """The matrix from the camera's pixels to the eye's, and the grey of those that the camera does not see."""
 
     weights: sparse.csr_array
     constant: Float[np.ndarray, "pixels"]
     source: tuple[int, int]  # px, width and height of the camera's pictures
     shape: tuple[int, int]  # rows and columns of the eye's picture
-    seen: float  # share of the eye's picture that the camera sees
+    seen: float  # fraction of the eye's picture that the camera sees
 
     def __call__(self, picture: UInt8[np.ndarray, "height width"]) -> UInt8[np.ndarray, "rows columns"]:
         """Return the eye's picture."""
@@ -57,15 +57,15 @@ def from_lens(calibrated: Lens, eye: camera.Params) -> Resampler:
 def from_same_lens(size: tuple[int, int], eye: camera.Params) -> Resampler:
     """Return the resampler from a camera with the eye's own lens, whose pictures may be larger.
 
-    Raises InputError for pictures of other proportions.
+    Raises InputError for pictures of another aspect ratio.
     """
     width, height = size
     if width * eye.height != height * eye.width or width < eye.width:
         raise InputError(
-            f"expected pictures of {eye.width} x {eye.height} px, or larger in this proportion, got {width} x {height} "
-            "without a --calibration; calibrate the camera with `lgmdjax calibrate-camera`"
+            f"expected pictures of {eye.width} x {eye.height} px, or larger in this aspect ratio, got "
+            f"{width} x {height} without a --calibration; calibrate the camera with `lgmdjax calibrate-camera`"
         )
-    n = -(-width // eye.width)  # rays at the middles of the camera's pixels, if it is a whole number
+    n = -(-width // eye.width)  # rays at the centres of the camera's pixels if the ratio is whole
     v, u = (np.mgrid[: n * eye.height, : n * eye.width] + 0.5) / n
     scale = width / eye.width
     points = np.stack([scale * u - 0.5, scale * v - 0.5]).reshape(2, -1)
@@ -74,7 +74,7 @@ def from_same_lens(size: tuple[int, int], eye: camera.Params) -> Resampler:
 
 
 def _rays_a_side(calibrated: Lens, eye: camera.Params) -> int:
-    """Return how many rays along a side of a pixel are closer to each other than the camera's pixels in the middle."""
+    """Return the number of rays along a side of a pixel that makes them denser than the camera's central pixels."""
     focal = max(calibrated.K[0, 0], calibrated.K[1, 1])
     return int(np.clip(np.ceil(focal * eye.fov / eye.width), 2, MAX_RAYS))
 
@@ -103,6 +103,6 @@ def _assemble(
     seen = float(np.mean(rays > 0))
     if seen < MIN_SEEN:
         raise InputError(
-            f"expected a camera that sees a quarter of the eye's picture, got {100 * seen:.0f} %; widen the lens"
+            f"expected a camera that sees a quarter of the eye's picture, got {100 * seen:.0f} %; use a wider lens"
         )
     return Resampler(matrix, np.where(rays > 0, 0.0, GREY), size, (eye.height, eye.width), seen)

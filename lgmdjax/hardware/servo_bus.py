@@ -1,8 +1,8 @@
 """The servos' half-duplex bus, through dynamixel-sdk: Protocol 1.0 of AX-12A and AX-18A.
 
-Set points go to all servos in one packet (sync write), which none of them answers. One servo at a time is asked for
-position, speed, load, voltage and temperature, which lie side by side in its table. A servo that is silent or garbled a
-few times in a row is a fault; a port that fails is lost.
+Set points go to all servos in one packet (sync write), which no servo answers. Position, speed, load, voltage and
+temperature are adjacent in a servo's table, and are read from one servo at a time. A servo whose answer is missing or
+garbled `MAX_FAILURES` times in a row counts as a fault; a port that fails counts as lost.
 """
 
 import select
@@ -29,17 +29,17 @@ Result = TypeVar("Result")
 STATUS_LENGTH = 8  # bytes: position, speed, load, voltage, temperature
 ANSWER_TIMEOUT = 0.012  # s; a USB adapter may hold back an answer for some milliseconds
 MAX_FAILURES = 4  # of a servo in a row
-CONNECT_ATTEMPTS, RELEASE_ATTEMPTS = 10, 6  # a start may take its time
-STOPPING = Fault.OVERHEATING | Fault.OVERLOAD | Fault.VOLTAGE  # what a servo says beside its answer
+CONNECT_ATTEMPTS, RELEASE_ATTEMPTS = 10, 6  # a servo may need time to start
+STOPPING = Fault.OVERHEATING | Fault.OVERLOAD | Fault.VOLTAGE  # errors that a servo adds to its answer
 
 
 class BusLost(Exception):
-    """The port fails, as when its plug is pulled."""
+    """The port failed, for example because it was unplugged."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """What a servo says of itself."""
+    """The status that a servo reports."""
 
     position: int
     speed: float  # rad/s, positive counter-clockwise
@@ -55,7 +55,7 @@ class ServoBus:
     Args:
         port: path of the serial port.
         baud: bits per second.
-        clock: of the robot.
+        clock: the robot's clock.
 
     Raises InputError if the port cannot be opened.
     """
@@ -71,10 +71,10 @@ class ServoBus:
             raise InputError(f"expected the port of the servos, got {port} ({reason}); check cable and name") from error
         if not opened:
             raise InputError(
-                f"expected a baud rate that the port knows, got {baud}; servos leave the factory with 1000000"
+                f"expected a baud rate that the port supports, got {baud}; servos leave the factory with 1000000"
             )
         self._goals = GroupSyncWrite(self._port, self._packets, Address.GOAL_POSITION, 2)
-        self.failures: dict[int, int] = {}  # of each servo, since its last good answer
+        self.failures: dict[int, int] = {}  # missing or garbled answers of each servo since its last good one
         self.failed = 0  # answers that were missing or garbled so far
         self.answered = 0
 
@@ -94,9 +94,9 @@ class ServoBus:
         return found
 
     def configure(self, ids: Sequence[int], *, speed: float, torque: float) -> None:
-        """Set highest speed [rad/s] and torque [of stall] of some servos, whose torque stays as it is.
+        """Set the highest speed [rad/s] and torque [of stall] of some servos; their torque stays on or off.
 
-        Raises InputError if a servo does not take them.
+        Raises InputError if a servo does not accept them.
         """
         for servo in ids:
             for address, entry in (
@@ -106,14 +106,14 @@ class ServoBus:
                 self._write_word(servo, address, entry)
 
     def write_goals(self, positions: dict[int, int]) -> None:
-        """Send the set points of some servos in one packet; it turns their torque on."""
+        """Send the set points of some servos in one packet, which turns their torque on."""
         self._goals.clearParam()
         for servo, position in positions.items():
             self._goals.addParam(servo, position.to_bytes(2, "little"))
         self._call(self._goals.txPacket)
 
     def read_status(self, servo: int) -> Status | None:
-        """Ask a servo for its status; None if the answer is missing or garbled, which is counted."""
+        """Return the status of a servo; None if the answer is missing or garbled, which counts as a failure."""
         data, result, error = self._call(
             lambda: self._packets.readTxRx(self._port, servo, Address.PRESENT_POSITION, STATUS_LENGTH)
         )
@@ -134,15 +134,15 @@ class ServoBus:
         )
 
     def has_error(self) -> bool:
-        """Return whether a servo was silent or garbled `MAX_FAILURES` times in a row."""
+        """Return whether answers of a servo were missing or garbled `MAX_FAILURES` times in a row."""
         return max(self.failures.values(), default=0) >= MAX_FAILURES
 
     def silent_servos(self) -> list[int]:
-        """Return the ids of the servos of `has_error`."""
+        """Return the ids of the servos for which `has_error` is true."""
         return sorted(servo for servo, count in self.failures.items() if count >= MAX_FAILURES)
 
     def release(self, ids: Sequence[int]) -> list[int]:
-        """Turn the torque of all servos off; return those of some ids that did not confirm it, on a lost port all."""
+        """Turn the torque of all servos off; return those of `ids` that did not confirm it."""
         left = list(ids)
         try:
             for _ in range(RELEASE_ATTEMPTS):
@@ -170,10 +170,10 @@ class ServoBus:
             result, error = self._call(lambda: self._packets.write2ByteTxRx(self._port, servo, address, entry))
             if result == COMM_SUCCESS and not error & (Fault.RANGE | Fault.CHECKSUM | Fault.INSTRUCTION):
                 return
-        raise InputError(f"expected servo {servo} to take its limits, got no answer; check its cable")
+        raise InputError(f"expected servo {servo} to accept its limits, got no answer; check its cable")
 
     def _call(self, send: Callable[[], Result]) -> Result:
-        """Call a function of the SDK; raise `BusLost` for what a port raises that is gone."""
+        """Call a function of the SDK; raise `BusLost` for the errors of a port that is gone."""
         try:
             return send()
         except (SerialException, OSError, termios.error, TypeError) as error:  # pyserial's port is None once closed
@@ -183,7 +183,7 @@ class ServoBus:
 
 
 class _Port(PortHandler):
-    """The SDK's port, which waits for bytes instead of asking for them all the time, on the robot's clock."""
+    """The SDK's port on the robot's clock, which waits for bytes instead of polling."""
 
     def __init__(self, name: str, clock: Clock):
         super().__init__(name)
@@ -204,7 +204,7 @@ class _Port(PortHandler):
 
 
 def check_installed() -> None:
-    """Raise `InputError` where dynamixel-sdk or pyserial is missing."""
+    """Raise `InputError` if dynamixel-sdk or pyserial is missing."""
     if not HAS_SDK:
         raise InputError(
             "expected dynamixel-sdk and pyserial, got an environment without them; pip install 'lgmdjax[drive]'"

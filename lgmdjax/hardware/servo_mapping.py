@@ -1,7 +1,8 @@
-"""Find out which servo is which joint: one servo at a time moves a little, and a person says which joint it was.
+"""Find out which servo moves which joint: one servo at a time moves a little, and a person says which joint moved.
 
-A joint moves by `NUDGE` and back, slowly and weakly, and then has no torque again, so that nothing can be hurt whatever
-it is. Its direction is what the person saw. Zeros are read from legs that the person holds in the zero posture.
+A servo moves by `NUDGE` and back, slowly and with little torque, and its torque is then turned off, so that it does no
+harm whichever joint it moves. The person also says in which direction the joint moved. The zeros are read while the
+person holds the legs in the zero posture.
 """
 
 import statistics
@@ -18,11 +19,11 @@ from lgmdjax.hardware.joint_map import JOINT_NAMES, JointMap
 from lgmdjax.hardware.servo_bus import ServoBus
 
 NUDGE = 24  # positions, 7 degrees
-NUDGE_SPEED, NUDGE_TORQUE = 0.5, 0.3  # rad/s, of the stall torque
+NUDGE_SPEED, NUDGE_TORQUE = 0.5, 0.3  # rad/s, fraction of the stall torque
 PAUSE = 0.7  # s for a nudge
 READS = 5
 MEANINGS = {"coxa": "to the left", "femur": "up", "tibia": "outward and up"}
-ZERO = "hold every leg straight out along its mount, femur level, tibia plumb"
+ZERO = "hold every leg straight out along its mount, femur level, tibia vertical"
 
 Ask = Callable[[str], str]
 """Shows a question and returns the answer."""
@@ -30,15 +31,15 @@ Ask = Callable[[str], str]
 
 @dataclass(frozen=True, kw_only=True)
 class Mapper:
-    """An open bus, and a person at it."""
+    """An open bus, and a person who answers questions."""
 
     bus: ServoBus
     clock: Clock
     ask: Ask
-    wait: Callable[[float], None]  # sleeps for some seconds of the wall
+    wait: Callable[[float], None]  # sleeps for some seconds of wall-clock time
 
     def map(self, ids: Sequence[int], baud: int) -> JointMap:
-        """Return the map of eighteen servos; raise `InputError` for another number of them."""
+        """Return the map of eighteen servos; raise `InputError` for any other number."""
         if len(ids) != len(JOINT_NAMES):
             listed = ", ".join(map(str, ids)) or "none"
             raise InputError(
@@ -63,23 +64,23 @@ class Mapper:
         )
 
     def _identify(self, servo: int, left: Sequence[int]) -> tuple[int, int]:
-        """Move a servo until the person knows it; return its joint, and 1 or -1 for its direction."""
+        """Move a servo until the person recognises its joint; return the joint, and 1 or -1 for its direction."""
         choices = "\n".join(f"  {joint + 1:2} {JOINT_NAMES[joint]}" for joint in left)
         while True:
             sign = self._nudge(servo)
             answer = self.ask(
-                f"{choices}\nservo {servo} moved and came back; which joint is it? (Enter: once more)"
+                f"{choices}\nservo {servo} moved and came back; which joint is it? (Enter: move again)"
             ).strip()
             if not answer.isdecimal() or int(answer) - 1 not in left:
                 continue
             joint = int(answer) - 1
             meaning = MEANINGS[JOINT_NAMES[joint].rpartition("_")[2]]
-            seen = self.ask(f"did {JOINT_NAMES[joint]} first move {meaning}? (y, n; Enter: once more)").strip().lower()
+            seen = self.ask(f"did {JOINT_NAMES[joint]} first move {meaning}? (y, n; Enter: move again)").strip().lower()
             if seen in ("y", "n"):
                 return joint, sign if seen == "y" else -sign
 
     def _nudge(self, servo: int) -> int:
-        """Move a servo by `NUDGE` and back; return 1 if it went to higher positions, -1 at the end of its range."""
+        """Move a servo by `NUDGE` and back; return 1 if it moved to higher positions, -1 if to lower ones."""
         start = self._position(servo)
         self.bus.write_goals({servo: start})
         self.bus.configure([servo], speed=NUDGE_SPEED, torque=NUDGE_TORQUE)
@@ -94,7 +95,7 @@ class Mapper:
         """Return the median of some readings; raise `InputError` for a servo that does not answer."""
         readings = [status.position for _ in range(READS) if (status := self.bus.read_status(servo)) is not None]
         if not readings:
-            raise InputError(f"expected servo {servo} to say where it is, got no answer; check its cable")
+            raise InputError(f"expected servo {servo} to report its position, got no answer; check its cable")
         return round(statistics.median(readings))
 
 

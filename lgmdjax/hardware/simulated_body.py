@@ -1,9 +1,9 @@
 """The simulated robot's body in C MuJoCo: the package's hexapod among the obstacles of a room, moved by its servos.
 
-Unlike `body.hexapod`, which shifts one barrier in front of each part, every obstacle and wall is a geom of its own
-shape, and the trunk can lie on the floor, so that the robot can sit. What the servos' table says holds: goal and moving
-speed, torque and its limit. A servo turns its set point towards the goal at the moving speed; without torque its motor
-adds nothing, and the friction of its gears is left.
+Every obstacle and wall is a geom of its own shape here, while `body.hexapod` moves one barrier in front of each part.
+The trunk can lie on the floor, so the robot can sit. The servos follow their control tables: goal position, moving
+speed, torque and torque limit. A servo moves its set point toward the goal at the moving speed. Without torque its
+motor does nothing, and only the friction of its gears remains.
 """
 
 from dataclasses import dataclass
@@ -22,28 +22,28 @@ from lgmdjax.world import arena
 from lgmdjax.world.obstacles import Prisms
 
 WALL = 0.1  # m, half thickness
-OBSTACLE, FLOOR = 2, 4  # bits of what touches the robot
+OBSTACLE, FLOOR = 2, 4  # contact bits of geoms that touch the robot
 TRUNK = ("trunk_left", "trunk_right", "trunk_battery", "trunk_shoulders", "bumper")
-START_HEIGHT = 0.045  # m, of the trunk's centre above the floor: it drops onto its belly
+START_HEIGHT = 0.045  # m, of the trunk's centre above the floor, from which it drops onto it
 GEAR_FRICTION = 0.12  # N m, of a servo without torque
 FREE_SPEED = 6.18  # rad/s, of a servo whose moving speed is 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contacts:
-    """What touches something else than the floor with its feet."""
+    """Contacts of the robot with obstacles and walls."""
 
     obstacle: bool
-    names: tuple[str, ...]  # of the robot's geoms
+    names: tuple[str, ...]  # names of the robot's geoms in contact
 
 
 class Body:
     """The robot in a room.
 
     Args:
-        room: at rest, whatever moves in it.
-        servos: which servo is which joint.
-        bank: the servos, whose tables this reads and writes.
+        room: the room, whose obstacles stay at rest.
+        servos: the joint map.
+        bank: the servos, whose tables the body reads and writes.
     """
 
     def __init__(self, room: arena.Arena, servos: JointMap, bank: Bank):
@@ -81,7 +81,7 @@ class Body:
         return to_angles(self._map, self._bank.entries(Address.GOAL_POSITION)).reshape(18)
 
     def step(self) -> None:
-        """Advance by the time step of the model, and write into the tables what the servos measure."""
+        """Advance by the time step of the model, and write the servos' measurements into their tables."""
         self._actuate()
         mujoco.mj_step(self.model, self.data)
         bank, turn = self._bank, self._map.directions
@@ -101,13 +101,13 @@ class Body:
         return Contacts(obstacle=bool(names), names=tuple(names))
 
     def push_over(self) -> None:
-        """Turn the robot onto its back, as a fall does."""
+        """Turn the robot onto its back, as after a fall."""
         self.data.qpos[2] = 0.15
         self.data.qpos[3:7] = [0.0, 1.0, 0.0, 0.0]
         self.data.qvel[:6] = 0.0
 
     def _actuate(self) -> None:
-        """Set what the motors do in the next step."""
+        """Set gains, torque limits, friction and set points of the motors for the next step."""
         torque = self._bank.entries(Address.TORQUE_LIMIT) / ax_servo.HIGHEST
         dead = np.array([servo.dead for servo in self._bank.servos.values()])
         active = self.torques() & (torque > 0) & ~dead
@@ -122,7 +122,7 @@ class Body:
         self.data.ctrl[:] = self.setpoints
 
     def _set_start(self, room: arena.Arena) -> None:
-        """Put the robot at the room's start, on its belly, with legs as a person leaves them."""
+        """Put the robot at the room's start, on its belly, with its legs at random angles near those of sitting."""
         x, y, yaw = np.asarray(room.start, float)
         legs = postures.row()[0] + np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3))
         low, high = hexapod.target_limits()

@@ -1,6 +1,6 @@
 """A simulated robot to drive: servos on a pseudo-terminal, eyes as a stream of pictures, a body in a room.
 
-The process serves three things, and none of them knows who uses it:
+The process serves three things to any program:
 
 | what            | where               | as                                                    |
 | --------------- | ------------------- | ----------------------------------------------------- |
@@ -8,7 +8,7 @@ The process serves three things, and none of them knows who uses it:
 | eyes            | a port of 127.0.0.1 | uncompressed pictures side by side (YUV4MPEG2), 30 Hz |
 | inertial sensor | a pseudo-terminal   | a line of three numbers for each picture (`inertial`) |
 
-All of it goes by one clock. Where the computer is too slow for it, the clock is set back, and a line says so.
+All of them use one clock. If the computer is too slow for it, the clock is set back.
 """
 
 import contextlib
@@ -41,15 +41,16 @@ from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS
 from lgmdjax.world import arena
 
 STEP = 1 / (FRAME_RATE * SUBSTEPS)  # s
-POLL, MAX_WAIT = 0.002, 0.05  # s of the wall, between two looks at a picture that is being rendered, and else
-MAX_LAG = 0.05  # s of physics that is caught up at once; beyond it the clock is set back
+POLL, MAX_WAIT = 0.002, 0.05  # s of wall-clock time; longest wait while a picture is rendered, and else
+MAX_LAG = 0.05  # s of physics to catch up at once; for a longer lag the clock is set back
 BYTE_TIME = ax_servo.BITS_PER_BYTE / ax_servo.BAUD_RATE  # s
 TRACE = ("time", "x", "y", "z", "upright", "touched", "torque", "pictures", *(f"joint_{j}" for j in range(18)))
-"""Columns of the trace: s, m, cosine of the tilt, whether an obstacle is touched, servos with torque, rad."""
+"""Columns of the trace: s, m, cosine of the tilt, whether an obstacle was touched, numbers of servos with torque and of
+pictures, rad."""
 
 
 class Terminal:
-    """A pseudo-terminal that stays open when its users come and go, and can be unplugged."""
+    """A pseudo-terminal that stays open while programs connect and disconnect, and can be unplugged."""
 
     def __init__(self) -> None:
         self.file, self._slave = os.openpty()
@@ -59,13 +60,13 @@ class Terminal:
         self.is_open = True
 
     def read(self) -> bytes:
-        """Return what came; nothing if nothing did."""
+        """Return the bytes that arrived; empty if there are none."""
         with contextlib.suppress(OSError):
             return os.read(self.file, 4096)
         return b""
 
     def write(self, content: bytes) -> None:
-        """Send bytes, if anybody makes room for them."""
+        """Send bytes; drop them if the buffer is full."""
         with contextlib.suppress(OSError):
             os.write(self.file, content)
 
@@ -78,7 +79,7 @@ class Terminal:
 
 
 class _Connection:
-    """A socket as a file for FFmpeg, which takes all that it is given or fails."""
+    """A socket as a file for FFmpeg, which sends all bytes of a write or fails."""
 
     def __init__(self, connection: socket.socket):
         self._connection = connection
@@ -90,10 +91,10 @@ class _Connection:
 
 
 class PictureServer:
-    """Sends pictures to everybody who connects to a port of this computer; who reads too slowly is cut off.
+    """Sends pictures to all clients of a local port; a client that reads too slowly is disconnected.
 
     Args:
-        port: to listen on; any free one if 0.
+        port: port to listen on; any free one if 0.
     """
 
     def __init__(self, port: int):
@@ -131,7 +132,7 @@ class PictureServer:
 
 
 class Renderer:
-    """Renders both eyes on a thread of its own, side by side."""
+    """Renders both eyes, side by side, on a background thread."""
 
     def __init__(self, room: arena.Arena, eye: camera.Params):
         self._render = partial(jax.jit(partial(_render, eye)), room)
@@ -139,23 +140,23 @@ class Renderer:
         self._pending: Future[np.ndarray] | None = None
 
     def compile(self, pose: hexapod.Pose) -> None:
-        """Render once and forget the picture."""
+        """Compile the renderer by rendering one picture."""
         self.start(pose)
         if self._pending is not None:
             self._pending.result()
         self._pending = None
 
     def start(self, pose: hexapod.Pose) -> None:
-        """Begin with a picture from a pose of the trunk, unless the one before is not done."""
+        """Start to render a picture from a pose of the trunk, unless another one is pending."""
         if self._pending is None:
             self._pending = self._thread.submit(lambda: np.asarray(self._render(pose)))
 
     def is_busy(self) -> bool:
-        """Return whether a picture was begun and not taken."""
+        """Return whether a picture is pending: started, but not taken."""
         return self._pending is not None
 
     def take(self) -> UInt8[np.ndarray, "height width"] | None:
-        """Return the picture that is done; None if there is none."""
+        """Return the finished picture; None if there is none."""
         if self._pending is None or not self._pending.done():
             return None
         picture, self._pending = self._pending.result(), None
@@ -170,7 +171,7 @@ def _render(eye: camera.Params, room: arena.Arena, pose: hexapod.Pose) -> jax.Ar
 
 @dataclass(kw_only=True)
 class SimulatedRobot:
-    """A robot, whose parts are open, and its state."""
+    """A simulated robot: its parts, which are open, and its state."""
 
     body: Body
     bank: Bank
@@ -180,29 +181,29 @@ class SimulatedRobot:
     bus: Terminal
     inertial: Terminal
     eyes: PictureServer
-    tell: Callable[[str], None]  # a line for the user
+    tell: Callable[[str], None]  # prints a line for the user
     trace: TextIO | None = None
     time: float = 0.0  # s, of the physics
     pictures: int = 0  # sent so far
     touched: bool = False
     _steps: int = 0
     _lag: float = 0.0  # s, by which the clock was set back
-    _command: bytes = b""  # begun, but not ended
+    _command: bytes = b""  # an incomplete line
     _at_end: bool = False  # no more commands come
     _answers: deque[tuple[float, bytes]] = field(default_factory=deque)  # due time, bytes
 
     def now(self) -> float:
-        """Return the time [s], which is the clock's but for what it was set back."""
+        """Return the robot's time [s]: that of the clock, less what it was set back."""
         return self.clock.now() - self._lag
 
     def run(self, seconds: float, commands: int | None) -> None:
-        """Serve for some seconds; obey the names of faults that come as lines from an open file, to its end."""
+        """Serve for some seconds; obey the names of faults in the lines of an open file, `commands`, until its end."""
         self._lag = self.clock.now()
         while self.time < seconds:
             self.turn(None if self._at_end else commands)
 
     def turn(self, commands: int | None = None) -> None:
-        """Catch up with the clock, send what is due, and wait for bytes or for the next step; arguments as of `run`."""
+        """Catch up with the clock, send what is due, and wait for bytes or for the next step; arguments as in `run`."""
         self._advance()
         self._serve(commands)
 
@@ -213,7 +214,7 @@ class SimulatedRobot:
         self.eyes.close()
 
     def _advance(self) -> None:
-        """Step the physics up to now; begin a picture every `SUBSTEPS` steps."""
+        """Step the physics up to now; start a picture every `SUBSTEPS` steps."""
         behind = self.now() - self.time
         if behind > MAX_LAG:
             self._lag += behind - MAX_LAG
@@ -248,7 +249,7 @@ class SimulatedRobot:
             self._obey(os.read(commands, 4096))
 
     def _obey(self, received: bytes) -> None:
-        """Obey the lines that are complete."""
+        """Obey the complete lines."""
         self._at_end = not received
         *lines, self._command = (self._command + received).split(b"\n")
         for line in lines:

@@ -1,12 +1,12 @@
-"""Simulated AX-12A servos: bytes of the bus in, bytes of their answers out, as the description of Protocol 1.0 says.
+"""Simulated AX-12A servos: bytes of the bus in, bytes of their answers out, according to Protocol 1.0.
 
 An instruction packet is 0xFF 0xFF, id, length, instruction, parameters, checksum; a status packet has an error byte in
 place of the instruction. The length counts what follows it; the checksum is the inverse of the sum of all bytes between
 the header and itself. A servo answers when its return delay has passed, and never to a broadcast. It sets an error bit
 for a wrong checksum, an unknown instruction, an entry out of range, a goal beyond its limits, and for temperature,
-voltage and load; after the errors that its table names under `SHUTDOWN` it lets go.
+voltage and load. It turns its torque off after the errors that its table lists at `SHUTDOWN`.
 
-Source: maker's e-manual of Protocol 1.0 and of the AX-12A. Nothing here comes from the SDK that drives the servos.
+Source: the maker's e-manual of Protocol 1.0 and of the AX-12A. Nothing here comes from the SDK that drives the servos.
 """
 
 from collections.abc import Iterator, Mapping
@@ -28,14 +28,14 @@ WORDS = frozenset(
         *(Address.PRESENT_LOAD, Address.PUNCH),
     }
 )
-FACTORY = {  # what is not zero in the table of a new AX-12A
+FACTORY = {  # nonzero values in the table of a new AX-12A
     **{Address.MODEL: 12, Address.FIRMWARE: 24, Address.ID: 1, Address.BAUD: 1, Address.RETURN_DELAY: 250},
     **{Address.HIGHEST_POSITION: 1023, Address.HIGHEST_TEMPERATURE: 70, Address.LOWEST_VOLTAGE: 60},
     **{Address.HIGHEST_VOLTAGE: 140, Address.MAX_TORQUE: 1023, Address.STATUS_RETURN_LEVEL: 2},
     **{Address.ALARM_LED: 36, Address.SHUTDOWN: 36, 26: 1, 27: 1, 28: 32, 29: 32, Address.TORQUE_LIMIT: 1023},
     **{Address.PRESENT_POSITION: 512, Address.PRESENT_VOLTAGE: 111, Address.PRESENT_TEMPERATURE: 36, Address.PUNCH: 32},
 }
-LARGEST: Mapping[int, int] = {  # entries that have a range of their own
+LARGEST: Mapping[int, int] = {  # largest values of entries whose range is limited
     **dict.fromkeys((Address.LOWEST_POSITION, Address.HIGHEST_POSITION, Address.GOAL_POSITION), 1023),
     **dict.fromkeys((Address.MOVING_SPEED, Address.TORQUE_LIMIT, Address.MAX_TORQUE, Address.PUNCH), 1023),
     **dict.fromkeys((Address.TORQUE_ENABLE, Address.LED, Address.LOCK), 1),
@@ -48,7 +48,7 @@ LATER_WRITABLE = range(Address.LOCK, ax_servo.TABLE_SIZE)
 
 @dataclass(frozen=True)
 class Packet:
-    """An instruction packet; `intact` tells whether its checksum is right."""
+    """An instruction packet; `intact` is whether its checksum is right."""
 
     servo: int
     instruction: int
@@ -80,7 +80,7 @@ class Parser:
         self._bytes = b""
 
     def feed(self, received: bytes) -> Iterator[Packet]:
-        """Yield the packets that are complete."""
+        """Yield the complete packets."""
         self._bytes += received
         while True:
             start = self._bytes.find(HEADER)
@@ -114,24 +114,24 @@ class Servo:
         self.reset()
 
     def reset(self) -> None:
-        """Write the factory's table, but for the id, which tells the servos of a robot apart."""
+        """Restore the factory's table, except for the id."""
         self.table[:] = 0
         for address, value in FACTORY.items():
             self.write_entry(address, value)
         self.table[Address.ID] = self.number
 
     def entry(self, address: int) -> int:
-        """Return a number of the table."""
+        """Return an entry of the table."""
         return int(self.table[address]) + (256 * int(self.table[address + 1]) if address in WORDS else 0)
 
     def write_entry(self, address: int, value: int) -> None:
-        """Write a number of the table as it is."""
+        """Write an entry of the table without any check."""
         self.table[address] = value & 0xFF
         if address in WORDS:
             self.table[address + 1] = value >> 8
 
     def alarms(self) -> Fault:
-        """Return the errors that last as long as their causes."""
+        """Return the errors of voltage and temperature, which last as long as their causes."""
         voltage, found = self.entry(Address.PRESENT_VOLTAGE), Fault(0)
         if not self.entry(Address.LOWEST_VOLTAGE) <= voltage <= self.entry(Address.HIGHEST_VOLTAGE):
             found |= Fault.VOLTAGE
@@ -140,7 +140,7 @@ class Servo:
         return found
 
     def obey(self, packet: Packet) -> Answer | None:
-        """Do what a packet says; return the answer, if there is to be one."""
+        """Execute a packet; return the answer, or None if there is none."""
         if self.dead:
             return None
         if not packet.intact:
@@ -171,7 +171,7 @@ class Servo:
         return self.table[address : address + size].tobytes(), Fault(0)
 
     def _write(self, parameters: bytes) -> Fault:
-        """Write bytes from an address on, all or none of them."""
+        """Write bytes, starting at an address, all or none; return the error."""
         address, content = parameters[0], parameters[1:]
         span = range(address, address + len(content))
         if not all(byte in WRITABLE or byte in LATER_WRITABLE for byte in span):
@@ -200,7 +200,7 @@ class Servo:
 
 
 class Bank:
-    """Servos on one bus, whose tables are the rows of one array, in the order of their ids as given."""
+    """Servos on one bus, whose tables are the rows of one array, in the order of `ids`."""
 
     def __init__(self, ids: tuple[int, ...]):
         self._tables = np.zeros((len(ids), ax_servo.TABLE_SIZE), np.uint8)
@@ -208,25 +208,25 @@ class Bank:
         self._parser = Parser()
 
     def entries(self, address: Address) -> Int[np.ndarray, "servos"]:
-        """Return a number of all tables."""
+        """Return one entry of every table."""
         low = self._tables[:, address].astype(int)
         return low + 256 * self._tables[:, address + 1].astype(int) if address in WORDS else low
 
     def write_entries(self, address: Address, values: Int[np.ndarray, "servos"]) -> None:
-        """Write a number of all tables as it is."""
+        """Write one entry of every table without any check."""
         self._tables[:, address] = values & 0xFF
         if address in WORDS:
             self._tables[:, address + 1] = values >> 8
 
     def shut_down(self) -> None:
-        """Let go of the servos with an alarm for which their tables want it."""
+        """Turn off the torque of servos with an alarm that their tables list at `SHUTDOWN`."""
         for servo in self.servos.values():
             if servo.alarms() & servo.entry(Address.SHUTDOWN):
                 servo.write_entry(Address.TORQUE_ENABLE, 0)
                 servo.write_entry(Address.TORQUE_LIMIT, 0)
 
     def receive(self, received: bytes) -> list[Answer]:
-        """Hand bytes of the bus to the servos; return their answers."""
+        """Pass bytes of the bus to the servos; return their answers."""
         answers = []
         for packet in self._parser.feed(received):
             if packet.instruction == Instruction.SYNC_WRITE and packet.intact:
@@ -238,7 +238,7 @@ class Bank:
         return answers
 
     def _write_in_sync(self, parameters: bytes) -> None:
-        """Write to several servos: address, size, and for each servo its id and so many bytes."""
+        """Write to several servos: address, size, and for each servo its id and that many bytes."""
         if len(parameters) < 2 or (len(parameters) - 2) % (parameters[1] + 1):
             return
         address, size = parameters[:2]

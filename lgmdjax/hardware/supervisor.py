@@ -1,15 +1,15 @@
-"""When the robot may walk, and when it has to stand, to sit down, or to let go: a pure state machine.
+"""A pure state machine that decides when the robot may walk, and when it must stand, sit or turn its torque off.
 
 | mode  | the robot                                                                  | next                         |
 | ----- | -------------------------------------------------------------------------- | ---------------------------- |
 | rise  | moves slowly from wherever its legs are to its stance                      | stand, once there            |
-| stand | holds its stance                                                           | walk, after a while of frames |
-| walk  | does what the nervous system says                                          | stand, without a new frame   |
+| stand | holds its stance                                                           | walk, after enough frames    |
+| walk  | follows the nervous system                                                 | stand, without a new frame   |
 | sit   | lowers its trunk to the floor                                              | off, once there              |
 | off   | has no torque; the end                                                     |                              |
 
-In every mode but off, in this order: the second request to stop, or a bus that is lost, turns the torque off at once; a
-fault or the first request makes the robot sit down. Nothing leads out of sit but off, and nothing out of off.
+In every mode but off, a lost bus or a second request to stop turns the torque off at once; otherwise a fault or a first
+request makes the robot sit down. Sit leads only to off, and off is final.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class Mode(Enum):
 
 
 class Reason(Enum):
-    """Why the robot sits down or lets go; the value says it to the user."""
+    """Why the robot sits down or turns its torque off; the value is shown to the user."""
 
     STOPPED = "asked to stop"
     FINISHED = "time is up"
@@ -55,11 +55,11 @@ class Params:
 
 @dataclass(frozen=True, kw_only=True)
 class Senses:
-    """What is known at a moment; a fault that is not known, as of an inertial sensor that is not there, is none."""
+    """What is known at one moment; a fault that cannot be known, as without an inertial sensor, counts as absent."""
 
     time: float  # s
     frame_age: float  # s since the last new frame; infinite before the first
-    arrived: bool  # the legs are where the mode wants them
+    arrived: bool  # the legs have reached the posture of the mode
     stops: int = 0  # requests to stop: Ctrl-C, SIGTERM, SIGHUP
     finished: bool = False  # the time that the user gave is up
     bus_error: bool = False  # a servo is silent or garbled for too long
@@ -86,7 +86,7 @@ def init(time: float) -> State:
 
 
 def step(params: Params, state: State, senses: Senses) -> State:
-    """Return the state after what is known now."""
+    """Return the next state, from what is known now."""
     state = replace(state, frames_since=_frames_since(params, state, senses))
     if state.mode is Mode.OFF:
         return state

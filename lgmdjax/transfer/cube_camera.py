@@ -1,17 +1,17 @@
 """The stereo fisheye camera by OpenGL: faces of a cube around each eye, averaged over the area of the fisheye's pixels.
 
-OpenGL draws pinhole pictures. Five faces of a cube, 90 degrees each, see all but what is behind. A pixel of the fisheye
-is the mean over `RAYS` x `RAYS` rays within its area, each of which reads the pixel of the face that it hits: one
-sparse matrix, made once. Faces that no pixel of the eye's hemifield meets are not drawn: two of five where the
-detectors look above the horizon.
+OpenGL renders pinhole pictures. Five faces of a cube, 90 degrees each, cover all directions except behind. A pixel of
+the fisheye is the mean over `RAYS` x `RAYS` rays within its area, each of which reads the pixel of the face that it
+hits. This is one sparse matrix, which is computed once. Faces that no pixel of the eye's hemifield meets are not
+rendered: two of five if the detectors see only what is above the horizon.
 
 | symbol | name                                  | unit | where                             |
 | ------ | ------------------------------------- | ---- | --------------------------------- |
 | u, v   | column and row from the middle        | px   | `sensors.camera`                  |
 | d      | direction, x forward, y left, z up    | 1    | `camera.equidistant_directions`   |
-| a, b   | place on a face, right and down       | 1    | in -1..1: d . right / d . axis    |
+| a, b   | position on a face, right and down    | 1    | in -1..1: d . right / d . axis    |
 
-`mujoco.Renderer` finds OpenGL by the variable MUJOCO_GL (egl, osmesa, glfw), which has to be set before MuJoCo is
+`mujoco.Renderer` chooses OpenGL by the variable MUJOCO_GL (egl, osmesa, glfw), which must be set before MuJoCo is
 imported (`runtime.jax_setup.prepare_opengl`).
 """
 
@@ -26,7 +26,7 @@ from lgmdjax.body import hexapod
 from lgmdjax.errors import InputError
 from lgmdjax.sensors import camera, camera_faults, hemifield
 
-FACE = 96  # px; on this face a pixel of the 80 px fisheye averages five, and a cell of its detector 46
+FACE = 96  # px; on this face a pixel of the 80 px fisheye averages five pixels, and a cell of its detector 46
 RAYS = 8  # along each side of a pixel
 SEEN = (0, 4)  # groups of geoms that the cameras see: the room, not the robot
 
@@ -67,10 +67,10 @@ class CubeCamera:
     """Renders the stereo pictures of one robot; a context manager that frees OpenGL's memory.
 
     Args:
-        model: of `robot_model.build`, with the same `face`.
-        params: of the fisheye camera.
+        model: from `robot_model.build`, with the same `face`.
+        params: parameters of the fisheye camera.
         lens: distortion and turn of the eyes (`camera_faults.Lens`).
-        whole: whether to draw all of the picture, and not the detectors' hemifields alone.
+        whole: render the whole picture, not only the detectors' hemifields.
         face: width of a face [px].
     """
 
@@ -90,7 +90,7 @@ class CubeCamera:
         self.weights = [resampling(params, side, lens=lens, whole=whole, face=face) for side in (0, 1)]
         try:
             self.renderer = mujoco.Renderer(model, face, face)
-        except Exception as error:  # each of OpenGL's back ends has its own
+        except Exception as error:  # each back end of OpenGL has its own exceptions
             reason = " ".join(str(error).split()) or type(error).__name__
             raise InputError(
                 f"expected OpenGL without a window, got none ({reason}); install libegl1 or libosmesa6, and set "
@@ -150,7 +150,7 @@ def resampling(
 
 
 def _within(count: int, ticks: np.ndarray) -> np.ndarray:
-    """Return the places of all rays along one side of the picture, from its middle [px]."""
+    """Return the positions of all rays along one side of the picture, from its middle [px]."""
     return (np.arange(count)[:, None] + ticks).ravel() - 0.5 * count
 
 

@@ -1,15 +1,15 @@
-"""The faults of the study, each drawn by a random key: cameras, servos and body of a robot that is not as calibrated.
+"""Faults of cameras, servos and body for the study `transfer`, each drawn with a random key.
 
 | name       | fault                                                                              |
 | ---------- | ---------------------------------------------------------------------------------- |
 | noise      | photon and read noise of the sensor (`camera_faults`: 20 electrons a grey level)    |
 | exposure   | gamma 0.7 to 1.4, and automatic exposure that drifts by 20 %                        |
 | vignetting | half the light lost at the edges                                                   |
-| blur       | the shutter is open for all of the frame                                           |
+| blur       | the shutter is open for the whole frame                                            |
 | jpeg       | JPEG at quality 50                                                                 |
 | drops      | 5 % of the pictures are lost                                                       |
 | latency    | 1, 2 or 3 frames                                                                   |
-| rate       | 25 pictures a second in place of 30                                                |
+| rate       | 25 pictures a second instead of 30                                                 |
 | lens       | off by 3 % at the edge, either way                                                 |
 | turn       | each eye turned by 2 degrees about a random axis                                   |
 | gains      | of each servo, within 10 %                                                         |
@@ -18,7 +18,7 @@
 | friction   | 0.5 to 1.5                                                                         |
 | payload    | -0.3 to 0.3 kg                                                                     |
 
-Of `together` a robot has all.
+The study's `together` is all of them at once.
 """
 
 from collections.abc import Callable, Mapping
@@ -38,7 +38,7 @@ FRAME_RATE, SLOW_RATE = 30.0, 25.0  # Hz
 
 @struct.dataclass(kw_only=True)
 class Faults:
-    """All that differs from the robot as calibrated."""
+    """All differences from the calibrated robot."""
 
     camera: camera_faults.Params = struct.field(default_factory=camera_faults.Params)
     lens: camera_faults.Lens = struct.field(default_factory=camera_faults.Lens)
@@ -132,7 +132,7 @@ FAULTS: Mapping[FaultName, Callable[[Faults, Array], Faults]] = {
 
 
 def draw(key: Array, *names: FaultName) -> Faults:
-    """Return a robot's faults of these names, drawn by a key; what one fault draws does not depend on the others.
+    """Return the named faults of one robot, drawn with a key; the draw of a fault does not depend on the others.
 
     >>> draw(jax.random.key(0), "jpeg").camera.quality
     50.0

@@ -1,4 +1,4 @@
-"""Names of the faults, and sizes of the study of transfer; free of JAX, for a fast command line."""
+"""Names of the faults; free of JAX, for a fast command line."""
 
 from typing import Literal, get_args
 

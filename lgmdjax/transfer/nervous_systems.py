@@ -1,8 +1,8 @@
-"""The nervous systems of a batch of robots, in the two rates of a real one: of pictures, and of the servos' set points.
+"""The nervous systems of a batch of robots, at a real robot's two rates: that of pictures and that of set points.
 
-`see` is what a picture causes, `move` what happens 180 times a second whether or not a picture came. Both are composed
-of the functions of `lgmdjax.control.controller`, as the closed loop of MJX and `deployment.nervous_system` are: with a
-picture before every sixth set point, they are the same system.
+`see` processes a picture; `move` runs 180 times a second, with or without a new picture. Both call the functions of
+`lgmdjax.control.controller`, as the closed loop in MJX and `deployment.nervous_system` do: with a picture before every
+sixth set point, they are the same system.
 """
 
 from dataclasses import replace
@@ -36,7 +36,7 @@ class State:
     controller: controller.State
     teacher: braitenberg.State
     response: lgmd.Response
-    distances: Float[Array, "2"]  # m, as the scanner measured them last
+    distances: Float[Array, "2"]  # m, the scanner's last measurement
     corridor: Float[Array, "2"]
     label: Float[Array, "2"]  # the teacher's velocity
     is_first: Bool[Array, ""]  # no picture came since the start or reset
@@ -69,7 +69,7 @@ def see(
     pictures: Float[Array, "2 height width"],
     ranges: Float[Array, " rays"],
 ) -> State:
-    """Take a picture and a scan; if a picture arrives, detect, and decide about the velocity."""
+    """Return the state after taking a picture and a scan; if a picture arrives, detectors and policy process it."""
     cameras = replace(state.cameras, previous=_previous(state, pictures))
     cameras, delivery = camera_faults.step(faults.camera, cameras, pictures)
     field = {"overlap": params.camera.overlap, "ground": params.camera.ground}
@@ -91,7 +91,7 @@ def see(
 
 
 def _previous(state: State, pictures: Array) -> Array:
-    """Return the picture before; at a start there was no motion."""
+    """Return the previous picture; at a start the present one, so that there is no motion."""
     started = ~jnp.any(state.cameras.arrives) & state.is_first
     return jnp.where(started, pictures, state.cameras.previous)
 
@@ -105,7 +105,7 @@ def move(params: closed_loop.Params, faults: Faults, state: State) -> tuple[Stat
 
 
 def restart(params: closed_loop.Params, faults: Faults, state: State, key: Array, lifted: Bool[Array, ""]) -> State:
-    """Return the state after a reset if the robot was `lifted`: that of a start, but the CPG goes on."""
+    """Return the state after a reset if the robot was `lifted`: the initial state, except that the CPG continues."""
     started = init(params, faults, key)
     started = replace(started, controller=replace(started.controller, cpg=state.controller.cpg))
     return _where(lifted, started, state)

@@ -1,8 +1,8 @@
 """The robot in a room, for C MuJoCo: its true geoms collide, with MuJoCo's default contacts, and it has cube cameras.
 
-In `mjcf/hexapod.xml` feet collide with the floor, and a few enlarged shapes with barriers, as MJX needs it. Here
-barriers and explicit pairs are left out, and every geom of the robot that is drawn collides with floor, walls and
-obstacles: hard contacts, with the friction of the geoms.
+In `mjcf/hexapod.xml` the feet collide with the floor, and a few enlarged shapes collide with barriers, as MJX requires.
+Here barriers and explicit pairs are left out. Every visible geom of the robot collides with floor, walls and obstacles,
+in hard contacts with the friction of the geoms.
 """
 
 import mujoco
@@ -14,16 +14,16 @@ from lgmdjax.world import mujoco_world
 from lgmdjax.world.arena import Arena
 from lgmdjax.world.mujoco_world import PHOTOGRAPHIC, ROBOT, WORLD, Style
 
-DRAWN = 2  # group of the robot's geoms in the XML
+DRAWN = 2  # group of the robot's visible geoms in the XML
 
 
 def build(room: Arena, style: Style = PHOTOGRAPHIC, *, seed: int = 0, face: int = cube_camera.FACE) -> mujoco.MjModel:
     """Return the robot's model with a single room around it.
 
     Args:
-        room: the room, not a batch.
-        style: how it looks.
-        seed: of textures and shapes.
+        room: a single room, not a batch.
+        style: appearance of the room.
+        seed: seed of textures and shapes.
         face: width of a face of the cube cameras [px].
     """
     spec = mujoco.MjSpec.from_file(str(hexapod.xml_path()))

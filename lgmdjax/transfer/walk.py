@@ -1,8 +1,8 @@
-"""Walks of a batch of robots in C MuJoCo, with pictures by OpenGL: the same record as the closed loop of MJX gives.
+"""Walks of a batch of robots in C MuJoCo, with pictures by OpenGL, recorded as by the closed loop in MJX.
 
-The order is that of a real robot. 180 times a second CPG, servos and physics advance, whether or not a picture came. 30
-or 25 times a second the cameras take a picture; when one arrives (`camera_faults`), detectors and policy work on it.
-After a touch the robot is lifted to its next start, at the next thirtieth of a second, as in `simulation.closed_loop`.
+The timing is that of a real robot. CPG, servos and physics advance 180 times a second, with or without a new picture.
+The cameras take a picture 30 or 25 times a second; when it arrives (`camera_faults`), detectors and policy process it.
+After a touch the robot is put at its next start, in the next frame of 1/30 s, as in `simulation.closed_loop`.
 
 A touch is a contact of any of the robot's geoms with a wall or an obstacle, in some physics step. The clearance is the
 smallest distance of trunk and legs (`hexapod.CAPSULES`) at the end of a frame, and zero after a touch.
@@ -34,13 +34,13 @@ from lgmdjax.transfer.names import FaultName
 from lgmdjax.world import arena, mujoco_world
 from lgmdjax.world.mujoco_world import PHOTOGRAPHIC, Style
 
-RAY_GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # what a scanner meets: all that can be touched, but the robot
+RAY_GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)  # what the scanner sees: all that can be touched, except the robot
 FAR = 10.0  # m; obstacles farther than this are not measured
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """What differs from the robot's own world, beside the engine."""
+    """Differences from the world in which the robot was trained, besides the engine."""
 
     style: Style = PHOTOGRAPHIC
     faults: tuple[FaultName, ...] = ()
@@ -71,9 +71,9 @@ def walk(
     *,
     label: str = "",
 ) -> Record:
-    """Walk a robot in each of some rooms, and return a record with axes (robot, frame).
+    """Return the record, axes (robot, frame), of a robot that walks in each of some rooms.
 
-    All robots of a call are walked side by side, so that one call of the nervous system serves all.
+    All robots advance together, so that one call of the nervous system serves all of them.
     """
     count = len(rooms.starts)
     drawn = [draw(jax.random.fold_in(rooms.key[k], world.seed), *world.faults) for k in range(count)]
@@ -91,7 +91,7 @@ def walk(
 
 
 class _Batch:
-    """Robots that walk side by side; everything that changes is in here."""
+    """Robots that walk together, with everything that changes."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class _Batch:
         self.bearings = np.asarray(laser.bearings(robot.laser), float)
 
     def frames(self, count: int) -> Iterator[dict[str, np.ndarray]]:
-        """Walk for some thirtieths of a second; yield the fields of a record of each."""
+        """Walk for `count` frames; yield the fields of the record for each frame."""
         period = FRAME_RATE * SUBSTEPS / self.faults.rate
         for frame in range(count):
             interruption.check()
@@ -136,7 +136,7 @@ class _Batch:
                 robot_model.reset(body.model, body.data, body.starts[self.resets[index] % len(body.starts)])
 
     def _look(self) -> None:
-        """Take pictures and scans, and let the nervous systems work on what arrives."""
+        """Take pictures and scans, and let the nervous systems process what arrives."""
         height, width = self.robot.camera.height, self.robot.camera.width
         pictures = np.zeros((len(self.bodies), 2, height, width), np.float32)
         for index, eyes in enumerate(self.cameras):
@@ -221,7 +221,7 @@ def _body(room: Room, faults: Faults, world: World, index: int) -> _Body:
 
 
 def _clearance(body: _Body) -> float:
-    """Return the distance of trunk and legs to the nearest wall or obstacle, and `FAR` if all are farther."""
+    """Return the distance of trunk and legs to the nearest wall or obstacle, at most `FAR`."""
     nearest = FAR
     for solid in body.solids:
         for capsule in body.capsules:

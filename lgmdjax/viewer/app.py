@@ -1,4 +1,4 @@
-"""`lgmdjax demo` and `lgmdjax view`: start the server and the page, say where it is, and run it."""
+"""`lgmdjax demo` and `lgmdjax view`: start the server, print the address of the page, and run the page."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,4 +49,4 @@ def run_view(path: Path | None, address: Address, out: Path, live: Live) -> None
 def _announce(viewer: Viewer, address: Address) -> None:
     where = web.address(viewer.server)
     opened = f" ({web.open_page(viewer.server)})" if address.browser else ""
-    print(f"the robot is at {where}{opened}; Ctrl-C ends", flush=True)
+    print(f"the robot is at {where}{opened}; Ctrl-C ends the viewer", flush=True)

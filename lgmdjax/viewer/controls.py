@@ -1,7 +1,7 @@
 """Controls in viser's panel: for a recorded walk, and for the live simulation.
 
-Callbacks of viser run on threads of its own. They only leave a note (`Playing`, or a command for the simulator); the
-loop of `lgmdjax.viewer.page` acts on it.
+viser runs callbacks on its own threads. They only change `Playing` or send a command to the simulator; the loop in
+`lgmdjax.viewer.page` shows the result.
 """
 
 import math
@@ -23,7 +23,7 @@ MAX_MARKS = 12  # of collisions below the slider
 
 @dataclass
 class Playing:
-    """Where a recorded walk is, and how fast it plays."""
+    """The present frame of a recorded walk, and how fast it plays."""
 
     frame: float = 0.0
     speed: float = 1.0
@@ -31,7 +31,7 @@ class Playing:
 
 
 class Transport:
-    """Play, pause, step, scrub and speed of a recorded walk."""
+    """Controls of a recorded walk: play, pause, step, slider and speed."""
 
     def __init__(self, server: "viser.ViserServer", playing: Playing, choose: Callable[[int], None]):
         self.playing, self._server, self._choose = playing, server, choose
@@ -64,7 +64,7 @@ class Transport:
                 self._choose(self._walk.options.index(self._walk.value))
 
     def set_paused(self, paused: bool) -> None:
-        """Pause or go on."""
+        """Pause or continue."""
         self.playing.paused = paused
         self._play.label = "Play" if paused else "Pause"
         self._play.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
@@ -93,7 +93,7 @@ class Transport:
                 self.playing.frame = (slider.value - first) * 30
 
     def show(self, time: float) -> None:
-        """Move the slider."""
+        """Move the slider to a time [s]."""
         if self._slider is not None:
             self._slider.value = min(max(time, self._slider.min), self._slider.max)
 
@@ -114,17 +114,17 @@ class LivePanel:
             self.pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             self.step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
             self.back = gui.add_button("Back to the recorded walk", icon=viser.Icon.ARROW_BACK)
-            self._policy = gui.add_dropdown("Driver", POLICY_NAMES, initial_value="learned")
+            self._policy = gui.add_dropdown("Policy", POLICY_NAMES, initial_value="learned")
             self._threshold = gui.add_slider("T_s", 0.0, 5.0, 0.05, 0.25, hint="threshold of a cell [grey]")
             self._suppression = gui.add_slider("T_f", 0.5, 60.0, 0.1, 8.5, hint="change that suppresses u [grey]")
             self._inhibition = gui.add_slider("W_I", 0.0, 2.0, 0.01, 0.1, hint="weight of the inhibition")
             self._gain = gui.add_slider("Turn gain", 0.0, 3.0, 0.05, 1.0)
-            self._speed = gui.add_slider("Speed", 0.0, 2.0, 0.05, 1.0, hint="of the mean of both sides")
-            self._pace = gui.add_dropdown("Pace", PACES, initial_value="1", hint="simulated seconds in a second")
-        self.place_folder = gui.add_folder("Put and record", visible=False)
+            self._speed = gui.add_slider("Speed", 0.0, 2.0, 0.05, 1.0, hint="factor on the mean of both sides")
+            self._pace = gui.add_dropdown("Pace", PACES, initial_value="1", hint="simulated seconds per second")
+        self.place_folder = gui.add_folder("Place and record", visible=False)
         with self.place_folder:
             gui.add_markdown("Drag an obstacle to move it.")
-            self.place = gui.add_button("Put the robot: click the floor", icon=viser.Icon.HAND_CLICK)
+            self.place = gui.add_button("Place the robot: click the floor", icon=viser.Icon.HAND_CLICK)
             self.heading = gui.add_slider("Heading [°]", -180, 180, 5, 0)
             self.keep = gui.add_button("Record", icon=viser.Icon.VIDEO)
         self._listen()
@@ -141,17 +141,17 @@ class LivePanel:
         self.start.label = "Enter the room"
 
     def leave(self) -> None:
-        """Hide the controls of a simulation that does not run."""
+        """Hide the controls while no simulation runs."""
         self.running.visible = self.place_folder.visible = False
         self.start.label = "Live"
 
     def yaw(self) -> float:
-        """Return the heading [rad] with which the robot is put somewhere."""
+        """Return the heading [rad] with which the robot is placed."""
         return math.radians(self.heading.value)
 
     def set_paused(self, paused: bool) -> None:
-        """Pause or go on."""
-        self.pause.label = "Go on" if paused else "Pause"
+        """Pause or continue."""
+        self.pause.label = "Continue" if paused else "Pause"
         self.pause.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
         self._change(paused=paused)
 

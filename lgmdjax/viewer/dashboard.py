@@ -25,7 +25,7 @@ BORDER, CAPTION = 3, 15  # px
 WINDOW = 10.0  # s, of the curves
 CURVES_EVERY = 3  # frames between two updates of the curves
 DIM = 0.5
-SEEN = (0.5, 0.5)  # fractions of the width and the height of its picture that an LGMD sees, if it is not said
+SEEN = (0.5, 0.5)  # default fractions of the width and the height of its picture that an LGMD sees
 
 
 class Dashboard:

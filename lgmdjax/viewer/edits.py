@@ -1,6 +1,6 @@
-"""Rooms whose obstacles are moved by hand while a robot walks, and the walks that are kept of it.
+"""Rooms whose obstacles the user moves while a robot walks, and recordings of such walks.
 
-A kept walk is an episode (`lgmdjax.simulation.episodes`). Its header has the room, and every change of it:
+A recorded walk is an episode (`lgmdjax.simulation.episodes`). Its header has the room, and every change of it:
 
 | parameter      | meaning                                                                        |
 | -------------- | ------------------------------------------------------------------------------ |
@@ -8,8 +8,8 @@ A kept walk is an episode (`lgmdjax.simulation.episodes`). Its header has the ro
 | live.seed      | of the room                                                                    |
 | live.policy    | policy at the end                                                              |
 | live.robot     | fingerprint of the robot                                                       |
-| live.arena     | the numbers of the room at the beginning, in the order of `jax.tree.leaves`    |
-| live.moves     | (frame, index, x, y) of every obstacle that is elsewhere than in the last frame |
+| live.arena     | the numbers of the room at the start, in the order of `jax.tree.leaves`        |
+| live.moves     | (frame, index, x, y) of every obstacle that moved since the last frame          |
 """
 
 from dataclasses import replace
@@ -34,7 +34,7 @@ FILM_SECONDS = 60.0
 
 
 class Kept:
-    """Frames of a live simulation since somebody began to record."""
+    """Frames of a live simulation since the start of a recording."""
 
     def __init__(self, room: arena.Arena):
         self.room = jax.tree.map(np.asarray, room)
@@ -42,12 +42,12 @@ class Kept:
         self.centres: list[np.ndarray] = []
 
     def append(self, record: Record, centres: np.ndarray) -> None:
-        """Keep a frame."""
+        """Add a frame."""
         self.records.append(record)
         self.centres.append(centres)
 
     def write(self, folder: Path, robot: closed_loop.Params, policy: PolicyName, place: JsonObject) -> Path:
-        """Write episode and film into a new folder, and return it."""
+        """Write the episode and a video into a new folder; return the folder."""
         if not self.records:
             raise InputError("expected some frames to write, got none; record for longer")
         record = jax.tree.map(lambda *leaves: np.stack(leaves)[None], *self.records)
@@ -70,7 +70,7 @@ class Kept:
 
 
 def read_edits(live: JsonObject, frames: int, path: Path) -> tuple[arena.Arena, np.ndarray]:
-    """Return the room at the beginning of a kept walk, and the centres of its obstacles in every frame."""
+    """Return the room at the start of a recorded walk, and the centres of its obstacles in every frame."""
     template = arena.empty_room()
     shapes = [leaf.shape for leaf in jax.tree.leaves(template)]
     try:
@@ -80,7 +80,7 @@ def read_edits(live: JsonObject, frames: int, path: Path) -> tuple[arena.Arena, 
         for frame, index, x, y in live["moves"]:
             centres[int(frame) :, int(index)] = x, y
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: expected a walk that the viewer kept, got {error}; record it again") from error
+        raise InputError(f"{path}: expected a walk that the viewer recorded, got {error}; record it again") from error
     return arena.validate(room), centres
 
 

@@ -35,7 +35,7 @@ from lgmdjax.viewer.messages import (
 from lgmdjax.world import arena
 
 ROOM_NAMES = (RANDOM_ROOM, *get_args(TrialName))
-MAX_LAG = 0.25  # s behind its time at which the simulation goes on from where it is
+MAX_LAG = 0.25  # s; the simulation does not catch up with a longer lag
 SMOOTHING = 0.95  # of the mean duration of a frame
 
 
@@ -65,17 +65,17 @@ class LiveSimulation:
         return Entered(room_shape.shape_of(self.room.arena), self._centres(), constants)
 
     def is_due(self) -> bool:
-        """Tell whether it is time for the next frame."""
+        """Return whether it is time for the next frame."""
         return self.steps > 0 or (not self.controls.paused and time.monotonic() >= self.due)
 
     def steer(self, controls: Controls) -> None:
-        """Take other controls."""
+        """Apply new controls."""
         if self.controls.paused and not controls.paused:
             self.due = time.monotonic()
         self.controls, self.params = controls, live_step.steer(self.robot, controls)
 
     def obey(self, command: Move | Place | Step | Keep) -> None:
-        """Change the room, the robot's pose, or what is kept."""
+        """Change the room or the robot's pose, step, or record."""
         match command:
             case Move():
                 self.room = replace(self.room, arena=edits.move(self.room.arena, *command))
@@ -90,7 +90,7 @@ class LiveSimulation:
                 self._write(folder, self.kept)
 
     def advance(self) -> LiveFrame:
-        """Simulate a frame."""
+        """Simulate a frame and return it."""
         started = time.monotonic()
         self.steps = max(self.steps - 1, 0)
         self.state, record, senses = live_step.frame(self.params, self.model, self.room, self.state)
@@ -123,7 +123,7 @@ class LiveSimulation:
 
     def _write(self, folder: Path, kept: edits.Kept) -> None:
         self.kept = None
-        self.report(Status("live: writing the episode and its film"))
+        self.report(Status("live: writing the episode and its video"))
         place = {"room": self.command.room, "seed": self.command.seed}
         written = kept.write(folder, self.robot, self.controls.policy, place)
         self.due = time.monotonic()
@@ -131,7 +131,7 @@ class LiveSimulation:
 
 
 def sample_room(name: str, seed: int) -> Room:
-    """Return a random room or that of a trial; raise `InputError` for another name."""
+    """Return a random room or that of a trial; raise `InputError` for any other name."""
     if name == RANDOM_ROOM:
         rooms = room_batches.random_rooms(jax.random.key(seed), 1)
     elif name in ROOM_NAMES:

@@ -1,6 +1,6 @@
-"""One frame of the live simulation as one compiled program, whatever its controls say.
+"""One frame of the live simulation, as one compiled program for all values of its controls.
 
-| input                       | where it is                                            |
+| input                       | place                                                  |
 | --------------------------- | ------------------------------------------------------ |
 | policy                      | `PolicySwitch.active`                                  |
 | T_s, T_f, W_I               | `lgmd.Params`                                          |
@@ -35,7 +35,7 @@ from lgmdjax.world import arena
 
 @struct.dataclass(kw_only=True)
 class SteeredParams:
-    """A switch of policies, whose velocity is scaled."""
+    """Parameters of a switch of policies whose velocity is scaled."""
 
     switch: PolicySwitch
     turn_gain: Float[Array, ""]
@@ -44,10 +44,10 @@ class SteeredParams:
 
 @struct.dataclass(kw_only=True)
 class Senses:
-    """What the robot senses in a frame, as bytes to be shown."""
+    """What the robot senses in a frame, as bytes for display."""
 
     pictures: UInt8[Array, "2 height width"]
-    layers: UInt8[Array, "2 3 rows columns"]  # E, I, S; the right eye's as it sees them
+    layers: UInt8[Array, "2 3 rows columns"]  # E, I, S, each as its eye sees the scene
 
 
 @struct.dataclass(kw_only=True)
@@ -72,7 +72,7 @@ STEERED = Policy("steered", lambda params, key: SWITCH.init(params.switch, key),
 
 
 def steer(robot: closed_loop.Params, controls: Controls) -> closed_loop.Params:
-    """Return the robot as the controls say; its own numbers where they say nothing."""
+    """Return the robot with the values of the controls; its own values for controls that are None."""
     constants = {name: getattr(controls, name) for name in ("threshold", "suppression", "inhibition")}
     given = {name: jnp.asarray(value, float) for name, value in constants.items() if value is not None}
     active = jnp.asarray(policies.POLICIES.index(policies.get_policy(controls.policy)))
@@ -95,7 +95,7 @@ def start(params: closed_loop.Params, model: mjx.Model, room: closed_loop.Room) 
 def frame(
     params: closed_loop.Params, model: mjx.Model, room: closed_loop.Room, state: closed_loop.State
 ) -> tuple[closed_loop.State, closed_loop.Record, Senses]:
-    """Run one frame; return also its record and what the robot sensed."""
+    """Return the next state, its record, and what the robot sensed."""
     before = state.controller.lgmd.difference
     after, record = closed_loop.step(params, model, room, state, STEERED)
     scene = arena.at_time(room.arena, record.time)
@@ -110,8 +110,8 @@ def replay(params: closed_loop.Params, room: arena.Arena, state: lgmd.State, pos
 
     Args:
         params: the robot.
-        room: in which it walked.
-        state: of both LGMDs before the first of the frames (`start_replay`).
+        room: the room in which it walked.
+        state: of both LGMDs before the first frame (`start_replay`).
         poses: the frames.
     """
 
@@ -138,7 +138,7 @@ def start_replay(params: closed_loop.Params) -> lgmd.State:
 def place(
     params: closed_loop.Params, room: closed_loop.Room, state: closed_loop.State, pose: Float[Array, "3"]
 ) -> closed_loop.State:
-    """Put the robot at rest at x, y, yaw, with new states of policy and teacher, as a reset after contact does."""
+    """Return the state with the robot at rest at x, y, yaw, policy and teacher new, as after a reset on contact."""
     there = replace(room, starts=jnp.broadcast_to(pose, room.starts.shape))
     after = closed_loop.reset(params, there, replace(state, contact=jnp.asarray(True)), STEERED)
     return replace(after, contact=jnp.asarray(False), ok=jnp.asarray(True))
@@ -159,7 +159,7 @@ def _at_rest(prisms: arena.Prisms, centres: Float[Array, "n 2"]) -> arena.Prisms
 def _render_whole(
     params: closed_loop.Params, scene: arena.Arena, position: Float[AnyArray, "3"], quaternion: Float[AnyArray, "4"]
 ) -> Float[Array, "2 height width"]:
-    """Render all of both pictures, also what no LGMD sees."""
+    """Render both pictures whole, with the parts that no LGMD sees."""
     pose = hexapod.Pose(position=jnp.asarray(position), quaternion=jnp.asarray(quaternion))
     return closed_loop.render_stereo(replace(params.camera, overlap=1.0, ground=0.0), scene, pose)
 
@@ -177,11 +177,11 @@ def _to_bytes(pictures: Float[Array, "2 height width"]) -> UInt8[Array, "2 heigh
 def _layers(
     params: lgmd.Params, before: Float[Array, "2 rows columns"], after: lgmd.State, is_first: Bool[AnyArray, ""]
 ) -> UInt8[Array, "2 3 rows columns"]:
-    """Return E, W_I |I| and S of both LGMDs (eqs. 8, 10, 11) as bytes, each eye's as it sees them.
+    """Return E, W_I |I| and S of both LGMDs (eqs. 8, 10, 11) as bytes, each as its eye sees the scene.
 
     Args:
         params: of the detectors.
-        before: their last change.
+        before: their change in the last frame.
         after: their state after the frame.
         is_first: there was no last change.
     """

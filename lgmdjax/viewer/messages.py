@@ -1,20 +1,20 @@
-"""What the viewer and its simulator, which is a process of its own, send each other.
+"""Messages between the viewer and its simulator, a separate process.
 
-The viewer imports no JAX, so that its page is there at once; only the simulator does.
+Only the simulator imports JAX, so that the viewer's page appears at once.
 
 | from the viewer | meaning                                                              |
 | --------------- | -------------------------------------------------------------------- |
-| `Open`          | send the recorded walks of a path, and this one of them              |
+| `Open`          | send the names of the recorded walks of a path, and one of the walks |
 | `Live`          | simulate a robot in a room from now on                               |
 | `Controls`      | simulate with these numbers; all are inputs of the compiled program  |
-| `Move`          | put an obstacle somewhere else                                       |
-| `Place`         | put the robot somewhere else                                         |
-| `Step`          | simulate one frame more, while paused                                |
-| `Keep`          | begin to keep the frames, or end and write them                      |
+| `Move`          | move an obstacle                                                     |
+| `Place`         | move the robot                                                       |
+| `Step`          | simulate one more frame, while paused                                |
+| `Keep`          | start to record frames, or stop and write them                       |
 
 | from the simulator  | meaning                                              |
 | ------------------- | ---------------------------------------------------- |
-| `Status`            | what it does; `failed` if it cannot go on            |
+| `Status`            | what it does; `failed` if it cannot continue         |
 | `Walks`             | what a path contains, and one of its walks           |
 | `Senses`            | pictures and layers of some frames of that walk      |
 | `Entered`           | the room of the live simulation                      |
@@ -45,7 +45,7 @@ class Live(NamedTuple):
 
     room: str = RANDOM_ROOM
     seed: int = 0
-    run: Path | None = None  # of the robot; the pretrained robot if None
+    run: Path | None = None  # run folder of the robot; the pretrained robot if None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class Controls:
     inhibition: float | None = None  # W_I
     turn_gain: float = 1.0  # of v_right - v_left
     speed: float = 1.0  # of the mean of v_left and v_right
-    pace: float = 1.0  # simulated seconds in a second
+    pace: float = 1.0  # simulated seconds per second
     paused: bool = False
 
 
@@ -83,7 +83,7 @@ class Step(NamedTuple):
 
 
 class Keep(NamedTuple):
-    """Keep frames from now on if `on`, else write what was kept into `folder`."""
+    """Record frames from now on if `on`, else write the recording into `folder`."""
 
     on: bool
     folder: Path | None = None
@@ -97,7 +97,7 @@ class Status(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """The LGMD's constants of a robot."""
+    """Constants of a robot's LGMDs."""
 
     threshold: float
     suppression: float
@@ -134,7 +134,7 @@ class LiveFrame(NamedTuple):
 
     time: float  # s, since the robot entered the room
     computed: float  # s, of the system's monotonic clock
-    milliseconds: float  # that a frame took, on average
+    milliseconds: float  # mean duration of a frame
     qpos: ndarray
     u: ndarray
     velocity: ndarray

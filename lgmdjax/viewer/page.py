@@ -1,7 +1,7 @@
 """The viewer: one page with a robot in its room, recorded or live.
 
-A recorded walk is shown by this process, without JAX. The live simulation is a process of its own; while it compiles,
-the recorded walk goes on, and the page changes over when the first frame is there.
+This process shows recorded walks, without JAX. The live simulation runs in a separate process. While it compiles, the
+recorded walk continues; the page switches to the simulation when the robot has entered its room.
 """
 
 import queue
@@ -42,7 +42,7 @@ from lgmdjax.viewer.simulator import Simulator
 if HAS_VISER:
     import viser
 
-TICK = 1 / 60  # s between two looks at the clock
+TICK = 1 / 60  # s; the loop pauses for half of it
 PICTURES_EVERY = 2  # frames between two updates of the pictures
 
 
@@ -58,7 +58,7 @@ class Viewer:
         self.opened: Open | None = None
         self.names: tuple[str, ...] = ()
         self.index, self.sensed, self._shown_frame = 0, 0, -1
-        # What viser's threads leave to the loop.
+        # Calls that viser's threads leave to the loop.
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.scene = WalkScene(self.server)
         self._lay_out()
@@ -78,7 +78,7 @@ class Viewer:
             self.dashboard.show_nothing()
 
     def start_live(self) -> None:
-        """Let the simulator put the robot into the room of the controls."""
+        """Start the live simulation in the room that the controls name."""
         if self.keeps:
             self._keep()
         self.live_panel.set_paused(False)
@@ -87,7 +87,7 @@ class Viewer:
         self.simulator.send(self.live_panel.controls, room)
 
     def run(self) -> None:
-        """Show what there is to show until the user interrupts."""
+        """Run the page until the user interrupts."""
         before = shown = time.monotonic()
         try:
             while True:
@@ -107,7 +107,7 @@ class Viewer:
             self.server.stop()
 
     def _take_all(self, reports: list[Report]) -> None:
-        """Show reports; of several simulated frames that came together only the last, so that none is shown late."""
+        """Show reports; of several simulated frames that arrive together show only the last, so that none is late."""
         frames = [report for report in reports if isinstance(report, LiveFrame)]
         for report in reports:
             if isinstance(report, LiveFrame) and report is not frames[-1]:
@@ -182,7 +182,7 @@ class Viewer:
             def _(event: "viser.SceneClickEvent") -> None:
                 x, y = self.scene.to_floor(event.ray_origin, event.ray_direction)
                 self.server.scene.remove_click_callback()
-                panel.place.label = "Put the robot: click the floor"
+                panel.place.label = "Place the robot: click the floor"
                 if np.isfinite([x, y]).all():
                     self.simulator.send(Place(x, y, panel.yaw()))
 
@@ -191,9 +191,9 @@ class Viewer:
             self.simulator.send(controls)
 
     def _keep(self) -> None:
-        """Begin to record, or end and write what was recorded."""
+        """Start to record, or stop and write the recording."""
         self.keeps = not self.keeps
-        self.live_panel.keep.label = "End and write" if self.keeps else "Record"
+        self.live_panel.keep.label = "Stop and write" if self.keeps else "Record"
         folder = self.out / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
         self.simulator.send(Keep(True) if self.keeps else Keep(False, folder))
 
@@ -215,7 +215,7 @@ class Viewer:
             self.status.content = "**recorded**"
 
     def _fail(self, text: str) -> None:
-        """End the command if there is nothing to show; else the page says it."""
+        """Show an error on the page; raise `InputError` if there is no walk to show."""
         self.live_panel.leave()
         if self.playback is None:
             raise InputError(text)
@@ -251,7 +251,7 @@ class Viewer:
         self.transport.show(float(playback.time[frame]))
 
     def _add_senses(self, report: Senses) -> None:
-        """Take what the robot sensed in some frames of the walk that is shown."""
+        """Store what the robot sensed in some frames of the present walk."""
         playback = self.playback
         if playback is None or self.is_live:
             return
@@ -275,7 +275,7 @@ class Viewer:
             self.dashboard.show_pictures(frame.pictures, frame.layers)
         self._tell_time(frame.time, frame.u, frame.velocity, frame.contact, self._pace(frame))
         if not frame.ok:
-            self.status.content = "**the robot fell: put it somewhere, or enter a room**"
+            self.status.content = "**the robot fell: place it somewhere, or enter a room**"
 
     def _note(self, frame: LiveFrame) -> None:
         """Add a frame to the curves, and mark its contact."""
@@ -285,7 +285,7 @@ class Viewer:
             self.contacts += 1
 
     def _pace(self, frame: LiveFrame) -> str:
-        """Say how fast the simulation is, and how long ago the frame was simulated."""
+        """Return a line about the speed of the simulation and the age of the frame."""
         delay = 1e3 * (time.monotonic() - frame.computed)
         return f"a frame takes {frame.milliseconds:.0f} ms of 33; shown {delay:.0f} ms after it was simulated"
 

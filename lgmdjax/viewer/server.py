@@ -1,10 +1,10 @@
-"""The viewer's web server: viser on one address, for pages of its own alone.
+"""The viewer's web server: viser on one address, for its own pages only.
 
-viser serves one page and one WebSocket, and looks at no Origin: any page that is open in the same browser could
-connect, press buttons and read the pictures. So a connection whose Origin is another than the address that was asked
-for is closed before anything is sent (`is_own_origin`); programs that are no browsers send no Origin. Names other than
-this machine's are refused while the server listens on the loopback address, so that a name that an attacker points to
-it (DNS rebinding) is refused too.
+viser serves one page and one WebSocket, and does not check the Origin header: any page open in the same browser could
+connect, press buttons and read the pictures. Therefore a connection whose Origin differs from the requested address is
+closed before anything is sent (`is_own_origin`); programs other than browsers send no Origin. While the server listens
+on the loopback address, host names other than this machine's are refused, so an attacker cannot point a name to it (DNS
+rebinding).
 """
 
 import errno
@@ -25,11 +25,11 @@ POLICY_VIOLATION = 1008  # code with which a WebSocket is closed (RFC 6455)
 
 
 def start(host: str, port: int) -> "viser.ViserServer":
-    """Start the server; raise `InputError` for a port or an address that cannot be had.
+    """Start the server; raise `InputError` for a port or an address that is not available.
 
     Args:
         host: address to listen on.
-        port: to listen on; 0 takes a free one.
+        port: port to listen on; 0 takes a free one.
     """
     walk_scene.check_installed()
     _require_free(host, port)
@@ -49,16 +49,16 @@ def address(server: "viser.ViserServer") -> str:
 
 
 def open_page(server: "viser.ViserServer") -> str:
-    """Open the page in a browser where there is one, and return a line about it."""
+    """Open the page in a browser, if there is one; return a line about it."""
     try:
         opened = webbrowser.open(address(server))
     except webbrowser.Error:
         opened = False
-    return "opened in the browser" if opened else "no browser found here; open it in one"
+    return "opened in the browser" if opened else "no browser found here; open the address in one"
 
 
 def is_own_origin(origin: str | None, asked: str, host: str) -> bool:
-    """Tell whether a page of some Origin may connect.
+    """Return whether a page with this Origin may connect.
 
     >>> is_own_origin("http://127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1")
     True
@@ -68,8 +68,8 @@ def is_own_origin(origin: str | None, asked: str, host: str) -> bool:
     False
 
     Args:
-        origin: header Origin; None for a program that is no browser.
-        asked: header Host.
+        origin: the header Origin; None for a program that is not a browser.
+        asked: the header Host.
         host: address that the server listens on.
     """
     if origin is None:
@@ -96,7 +96,7 @@ def _refuse_other_origins(server: "viser.ViserServer", host: str) -> None:
 
 
 def _require_free(host: str, port: int) -> None:
-    """Raise `InputError` unless the port is free: viser would take the next one without a word."""
+    """Raise `InputError` unless the port is free: viser would silently take the next one."""
     if not 0 <= port <= 65535:
         raise InputError(f"expected a --port of 0 to 65535, got {port}; 8080 is the default, 0 takes a free one")
     try:
@@ -110,6 +110,6 @@ def _require_free(host: str, port: int) -> None:
         raise InputError(f"expected an address of this machine as --host, got {host}: {error.strerror}") from None
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            reason = f"expected a free port, got {port}, which is in use; end what uses it, or choose another: --port 0"
+            reason = f"expected a free port, got {port}, which is in use; stop its program, or choose another: --port 0"
             raise InputError(reason) from None
         raise InputError(f"expected an address of this machine as --host, got {host}: {error.strerror}") from None

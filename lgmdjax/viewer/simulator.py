@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from lgmdjax.viewer.messages import Command, Report, Status
 
 GRACE = 0.5  # s for the process to end by itself
-MAX_WAITING = 30  # reports that wait to be shown; then the simulator waits
+MAX_WAITING = 30  # reports that wait to be shown; with more, the simulator waits
 
 
 class Simulator:
@@ -24,21 +24,21 @@ class Simulator:
         self._sending = threading.Lock()
 
     def send(self, *commands: Command) -> None:
-        """Send commands, to a new process if there is none."""
+        """Send commands; start the process if it does not run."""
         with self._sending:
             process = self._process if self._process is not None and self.runs else self._start()
-            with contextlib.suppress(OSError):  # the end of its output, too, says that it ended
+            with contextlib.suppress(OSError):  # the end of its output also says that it ended
                 for command in commands:
                     pickle.dump(command, process.stdin)  # type: ignore[arg-type]
                 process.stdin.flush()  # type: ignore[union-attr]
 
     @property
     def runs(self) -> bool:
-        """Tell whether there is such a process."""
+        """Whether the process runs."""
         return self._process is not None and self._process.poll() is None
 
     def reports(self) -> Iterator[Report]:
-        """Yield the reports that have come since."""
+        """Yield the reports that have arrived."""
         while True:
             try:
                 yield self._reports.get_nowait()
@@ -57,7 +57,7 @@ class Simulator:
         self._process = None
 
     def _start(self) -> "subprocess.Popen[bytes]":
-        # In a session of its own, so that Ctrl-C ends the viewer, which then ends it.
+        # Ctrl-C must not reach it: the viewer ends, and then ends it.
         self._process = subprocess.Popen(
             [sys.executable, "-m", "lgmdjax.viewer.worker"],
             stdin=subprocess.PIPE,
@@ -72,6 +72,6 @@ class Simulator:
         try:
             while True:
                 self._reports.put(pickle.load(process.stdout))  # type: ignore[arg-type]
-        except Exception:  # the end of its output, or half of a report
+        except Exception:  # the end of its output, or an incomplete report
             if process is self._process:
                 self._reports.put(Status("the simulator ended; press Live again", failed=True))

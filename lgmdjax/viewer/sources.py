@@ -6,11 +6,11 @@
 | folder of a trial (`lgmdjax trial`)   | of the trial                                                      |
 | run folder (`lgmdjax reproduce`)      | of the learned policy's walks in the testing room, else of the teacher's |
 
-Every frame has the joint angles, so legs are drawn as they were. Pictures are not recorded: they are rendered again, as
-the robot's camera sees the room, and the LGMDs run on them again.
+Every frame has the joint angles, so the legs are drawn as they moved. Pictures are not recorded: they are rendered
+again, as the robot's camera sees the room, and the LGMDs run on them again.
 
-The header of the walks tells how their rooms were made (`lgmdjax.datasets.recorded_rooms`); that of a walk of the
-live simulation has its room and every move of an obstacle (`lgmdjax.viewer.edits`).
+The header of the walks says how their rooms were made (`lgmdjax.datasets.recorded_rooms`); that of a walk of the live
+simulation contains its room and every move of an obstacle (`lgmdjax.viewer.edits`).
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ from lgmdjax.viewer.walk_paths import find_walks
 from lgmdjax.world.arena import Arena
 
 FRAMES_PER_CALL = 30  # rendered at once; the last call is padded
-SHOWN_WIDTH = 160  # px; wider pictures are shown at a part of their columns and rows
+SHOWN_WIDTH = 160  # px; wider pictures are subsampled
 
 
 class WalkSource:
@@ -67,7 +67,7 @@ class WalkSource:
         return Walks(names, self.index, playback)
 
     def is_behind(self) -> bool:
-        """Tell whether there are frames that were not rendered yet."""
+        """Return whether some frames are not rendered yet."""
         return self.done < len(self.walk)
 
     def sense(self) -> Senses:

@@ -1,15 +1,15 @@
-"""Where the recorded walks of a path are; looked up without JAX, so that a wrong path is refused at once."""
+"""Find the recorded walks of a path, without JAX, so that a wrong path is refused at once."""
 
 from pathlib import Path
 
 from lgmdjax.errors import InputError
 
 FOLDERS = (".", "trial", "evaluate/testing/learned", "collect/episodes")
-"""Where a folder may have its walks; the first that has any is read."""
+"""Subfolders that may hold walks; the first that does is read."""
 
 
 def find_walks(path: Path) -> tuple[Path, set[int] | None]:
-    """Return the folder with the walks of a path, and which episodes of it are meant; None stands for all."""
+    """Return the folder with the walks of a path, and which of its episodes are meant; None for all."""
     if path.is_file():
         if path.suffix != ".parquet":
             raise InputError(f"expected a run, a trial or a chunk-*.parquet, got {path}; `lgmdjax trial` makes one")

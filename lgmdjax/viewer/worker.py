@@ -1,7 +1,7 @@
 """The simulator: a process that reads commands on its input and writes reports to its output, as pickles.
 
-`python -m lgmdjax.viewer.worker` is started by `lgmdjax.viewer.simulator`, and ends when its input does: also in the
-middle of compiling, and also if the viewer was killed.
+`python -m lgmdjax.viewer.worker` is started by `lgmdjax.viewer.simulator`, and ends when its input does, even
+while it compiles, or if the viewer was killed.
 """
 
 import os
@@ -18,7 +18,7 @@ from lgmdjax.viewer.live import LiveSimulation
 from lgmdjax.viewer.messages import Command, Controls, Keep, Live, Move, Open, Place, Report, Status, Step
 from lgmdjax.viewer.sources import WalkSource
 
-IDLE = 0.05  # s between two looks for commands, while nothing is simulated
+IDLE = 0.05  # s between two checks for commands, while nothing is simulated
 
 
 class Worker:
@@ -37,7 +37,7 @@ class Worker:
         self.output.flush()
 
     def run(self) -> None:
-        """Take commands for ever."""
+        """Execute commands until the process ends."""
         while True:
             try:
                 self._turn()
@@ -86,7 +86,7 @@ def main() -> None:
         try:
             while True:
                 worker.commands.put(pickle.load(sys.stdin.buffer))
-        except Exception:  # the end of the input, or half of a command
+        except Exception:  # the end of the input, or an incomplete command
             os._exit(0)
 
     threading.Thread(target=listen, daemon=True).start()

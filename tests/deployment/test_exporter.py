@@ -100,7 +100,7 @@ def test_only_what_the_c_program_can_do_is_written(float32):
     params = nervous_system.from_robot(robot)
     controller = params.controller
     smooth = replace(params, controller=replace(controller, lgmd=replace(controller.lgmd, smooth=True)))
-    with pytest.raises(InputError, match="expected an LGMD with steps"):
+    with pytest.raises(InputError, match="expected an LGMD with hard thresholds"):
         c_source.generate(smooth, "a robot")
     other = navigator.create(jax.random.key(0), "feed-forward")
     with pytest.raises(InputError, match=r"expected an LSTM .*got feed-forward"):

@@ -106,7 +106,7 @@ def test_a_camera_with_the_eyes_own_lens_is_averaged() -> None:
     np.testing.assert_array_equal(resampling.from_same_lens((40, 30), EYE)(same), same)
     with pytest.raises(InputError, match="calibrate-camera"):
         resampling.from_same_lens((160, 90), EYE)
-    with pytest.raises(InputError, match="widen the lens"):
+    with pytest.raises(InputError, match="use a wider lens"):
         K = np.array([[400.0, 0, 160], [0, 400, 120], [0, 0, 1]])
         resampling.from_lens(Lens(model="pinhole", size=(320, 240), K=K, D=np.zeros(4)), EYE)
 

@@ -159,7 +159,7 @@ def test_joint_maps_are_read_as_they_were_written(tmp_path) -> None:
     ("before", "after", "words"),
     [
         ("baud = 1000000", "baud = ", "joint map in TOML"),
-        ("id = 2\n", "id = 1\n", "another servo than left_front_coxa has"),
+        ("id = 2\n", "id = 1\n", "an id that left_front_coxa does not have"),
         ("direction = 1\n", "direction = 0\n", "1 or -1"),
         ("[joints.left_front_tibia]", "[joints.left_tibia]", "left_front_tibia"),
         ("highest = 75.0", "highest = 80.0", "in -75 to 75 deg"),
