@@ -1,17 +1,17 @@
 """A hexapod robot that avoids obstacles with two looming detectors, differentiable end to end in JAX.
 
-`import lgmdjax as lj` gives the names below. Each is imported when it is first used, so that the import itself and
-`lgmdjax --help` take no time.
+`import lgmdjax as lj` gives the names below. Each is imported when it is first used, so the import itself and
+`lgmdjax --help` are fast.
 
 | name | what |
 | --- | --- |
-| load_robot, random_rooms, rollout, run_trial | a robot, rooms, and walks of the one in the others |
-| score, plot_walks, write_video, show_walk, walk_page | of walks: numbers, figure, video, in a notebook, in 3D |
-| Record, Room, InputError | the types that they pass and the error that they raise |
-| lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components: `init` and `step` of one agent |
+| load_robot, random_rooms, rollout, run_trial | a robot, rooms, walks of the robot in the rooms, a trial |
+| score, plot_walks, write_video, show_walk, walk_page | walks as metrics, figure, video, in a notebook, in 3D |
+| Record, Room, InputError | types that these functions pass, and the error that they raise |
+| lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components of one robot, each with `init` and `step` |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
-| simulation, deployment, transfer, hardware, reporting, evaluation, learning | what is done with them |
-| datasets, environments, viewer, studies, pipeline, cli, runtime | for other libraries, in the browser, by commands |
+| simulation, deployment, transfer, hardware, reporting, evaluation, learning | what is done with the robot |
+| datasets, environments, viewer, studies, pipeline, cli, runtime | other libraries, browser, studies, commands, files |
 
 >>> import jax
 >>> import lgmdjax as lj

@@ -6,7 +6,7 @@ class InputError(ValueError):
 
 
 def one_line(text: object) -> str:
-    r"""Return a text as one line without control characters, which a terminal would obey; they are escaped.
+    r"""Return a text as one line, with control characters escaped so that a terminal does not execute them.
 
     >>> one_line("a\n  b \x1b[2J")
     'a b \\x1b[2J'

@@ -35,7 +35,7 @@ def rotation_matrix(quaternion: Float[Array | np.ndarray, "4 *n"]) -> Float[Arra
 def yaw(quaternion: Float[np.ndarray, "*n 4"]) -> Float[np.ndarray, "*n"]:
     """Return the heading [rad] in (-pi, pi] of recorded quaternions, positive to the left.
 
-    In the precision of the quaternions. Traced code has the rotation matrix at hand and takes it from there
+    The result has the precision of the quaternions. Traced code computes the heading from the rotation matrix instead
     (`hexapod.yaw`).
 
     >>> yaw(np.array([[1.0, 0.0, 0.0, 1.0]]) / np.sqrt(2)).round(4)
@@ -55,7 +55,7 @@ def rotate(vector: Float[Array, "*#shape 2"], angle: Float[Array, "*#shape"]) ->
 def rotate_recorded(vector: Float[np.ndarray, "*#shape 2"], angle: np.ndarray | float) -> Float[np.ndarray, "*shape 2"]:
     """Rotate plane vectors by `angle` [rad], counter-clockwise, as `rotate` does, in NumPy and double precision.
 
-    A function of its own: NumPy's complex exponential and JAX's sine and cosine differ in the last bit.
+    It is a separate function because NumPy's complex exponential and JAX's sine and cosine differ in the last bit.
     """
     rotated = (vector[..., 0] + 1j * vector[..., 1]) * np.exp(1j * angle)
     return np.stack([rotated.real, rotated.imag], axis=-1)

@@ -1,7 +1,6 @@
-"""Rich representations in notebooks: a table of what a dataclass holds, with the comments of its fields.
+"""Display of dataclasses in notebooks: a table of the fields with their values and their comments in the source.
 
-The comment that stands beside a field in the source says its unit and meaning. It is what the table shows, so that both
-have one home.
+The comment beside a field gives its unit and meaning. The table shows that comment, so the text exists only once.
 """
 
 import ast
@@ -92,7 +91,7 @@ def _rows(value: object, name: str, comment: str = "") -> Iterator[tuple[str, st
 
 
 def _leaf(value: object) -> str:
-    """Return a number, a short array, or type, shape and range of a long one."""
+    """Return the text of a number or a short array; of a long array its dtype, shape and range."""
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if shape is None or dtype is None:
         return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -75,7 +75,7 @@ def build(model: mujoco.MjModel | None = None) -> mjx.Model:
     for expected, found in zip(_anatomy().geom_names, _geom_names(model), strict=False):
         if found != expected:
             raise InputError(
-                f"expected the geoms of this package's hexapod.xml in its order, got {found or 'one without a name'} "
+                f"expected the geoms of this package's hexapod.xml in their order, got {found or 'one without a name'} "
                 f"for {expected}; start from that file, and add other geoms at its end"
             )
     with jax.numpy_dtype_promotion("standard"):
@@ -245,10 +245,8 @@ def scale_tilt(pose: Pose, factor: Float[Array, ""]) -> Pose:
     """
     w, x, y, z = pose.quaternion
     length = jnp.hypot(w, z)
-    c, s = (
-        w / length,
-        z / length,
-    )  # of half the heading: a pose is a tilt about a level axis, then a rotation by the heading
+    # Cosine and sine of half the heading: a pose is a tilt about a level axis, then a rotation by the heading.
+    c, s = w / length, z / length
     a, b = c * x + s * y, c * y - s * x
     sine = jnp.hypot(a, b)
     half = factor * jnp.arctan2(sine, length)

@@ -1,4 +1,4 @@
-"""The robot's XML for C MuJoCo, without JAX: what draws recorded walks needs no more."""
+"""The robot's XML for C MuJoCo. Imports no JAX, which drawing recorded walks doesn't need."""
 
 from pathlib import Path
 

@@ -1,13 +1,13 @@
-"""Faults of servos and body, drawn by a random key: gains, backlash, delay; friction of the ground, and payload.
+"""Faults of servos and body: gains, backlash and delay of the servos; friction of the ground, and payload.
 
-What is on the way to a servo (`step`) is a pure function of (parameters, state, set points), once for each physics step
-of a robot. What the body itself is like (`apply_to_model`) is a model of its own.
+`step` applies backlash and delay to the set points, as a pure function of (parameters, state, set points), once per
+physics step of a robot. `apply_to_model` applies gains, friction and payload to a copy of the robot's model.
 
 | symbol | name                                         | unit | where                                           |
 | ------ | -------------------------------------------- | ---- | ----------------------------------------------- |
 | q*     | set points                                   | rad  | (6, 3)                                          |
 | tau    | delay                                        | s    | q*(t - tau), linear between two physics steps   |
-| b      | backlash, the whole play                     | rad  | y = clip(y, q* - b/2, q* + b/2)                 |
+| b      | backlash, full width of the play             | rad  | y = clip(y, q* - b/2, q* + b/2)                 |
 | k_p    | position gain of a servo                     | N m/rad | multiplied by `gain`                         |
 
 The play operator of backlash keeps its output until the set point has crossed the play.
@@ -23,12 +23,12 @@ from jaxtyping import Array, Float
 
 from lgmdjax.minmax import clip
 
-MAX_STEPS = 12  # physics steps that a set point may be late
+MAX_STEPS = 12  # largest delay of a set point, in physics steps
 
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """Faults of the servos; the defaults are none."""
+    """Faults of the servos; by default there are none."""
 
     backlash: Float[Array, ""] | float = 0.0  # b
     delay: Float[Array, ""] | float = 0.0  # tau, less than `MAX_STEPS` physics steps
@@ -36,7 +36,7 @@ class Params:
 
 @struct.dataclass(kw_only=True)
 class Body:
-    """How a body differs from its model; the defaults are not at all."""
+    """How a body differs from its model; by default it does not."""
 
     gain: Float[Array, "6 3"] | float = 1.0  # factor of k_p
     friction: Float[Array, ""] | float = 1.0  # factor of the friction of feet and floor
@@ -45,14 +45,14 @@ class Body:
 
 @struct.dataclass(kw_only=True)
 class State:
-    """Set points on their way, the latest first, and what is left of them after backlash."""
+    """Delayed set points, the latest first, and the set points after backlash."""
 
     waiting: Float[Array, "steps 6 3"]
     output: Float[Array, "6 3"]
 
 
 def init(params: Params, targets: Float[Array, "6 3"]) -> State:
-    """Return the state of servos that have stood at their set points."""
+    """Return the state of servos at rest at their set points."""
     return State(waiting=jnp.broadcast_to(targets, (MAX_STEPS + 1, 6, 3)), output=targets)
 
 
@@ -74,7 +74,7 @@ def step(
 
 
 def apply_to_model(model: mujoco.MjModel, body: Body) -> mujoco.MjModel:
-    """Return a copy of a robot's model whose servos, friction and mass differ; `hexapod.build` takes it for MJX too.
+    """Return a copy of a robot's model whose servos, friction and mass differ; `hexapod.build` converts it to MJX.
 
     The payload is in the middle of the trunk, whose inertia grows in proportion.
     """

@@ -38,7 +38,7 @@ def _expand(name: str) -> Sequence[str]:
 def table(rows: Sequence[JsonObject]) -> str:
     """Return the scores as a Markdown table, a row for each detector.
 
-    The columns of stimuli have the mean peak of the clips of a kind, over that of the dark approaches.
+    A stimulus column is the mean peak over the clips of that kind, divided by the mean peak of the dark approaches.
     """
     lines = [COLUMNS, ("---",) * len(COLUMNS), *(_row(row) for row in rows)]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)

@@ -6,7 +6,7 @@ Writes to a folder with the name of the clips' folder:
 | ------------- | ----------------------------------------------------------------------------- |
 | index.html    | tables, ROC, and the responses to every clip below its pictures               |
 | scores.md     | the tables as Markdown                                                        |
-| scores.json   | all scores, with settings and beginnings of the alarms                        |
+| scores.json   | all scores, with the settings and the onsets of the alarms                    |
 | responses.csv | u, excitation, adapted response and whole-field change of every frame         |
 """
 
@@ -32,8 +32,8 @@ from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import partial_files, storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
-SCALES = {"own": "u", "adapted": "adapted"}  # name in scores.json, and in `Trace`
-FIXED = clip_scores.Setting(AlarmFlags.threshold, AlarmFlags.persistence)  # those of `lgmdjax watch`
+SCALES = {"own": "u", "adapted": "adapted"}  # name in scores.json: field of `Trace`
+FIXED = clip_scores.Setting(AlarmFlags.threshold, AlarmFlags.persistence)  # defaults of `lgmdjax watch`
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg")
 COLUMNS = ("detector", "AUC u", "AUC adapted", "peak at contact", "hits", "false alarms / min", "lead [s]", "halves")
 Traces = Mapping[str, Sequence[Trace]]
@@ -77,10 +77,10 @@ def _read_arguments(paths: Sequence[Path]) -> tuple[Path, list[Label]]:
     videos = {path.name for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES}
     unlabelled = sorted(videos - {label.clip for label in labels})
     if unlabelled:
-        print(f"note: no label for {', '.join(unlabelled)}, left out; add rows to score them", file=sys.stderr)
+        print(f"note: no label for {', '.join(unlabelled)}; add rows to score them", file=sys.stderr)
     unusual = sorted({label.kind for label in labels} - {*clip_labels.APPROACHING, *clip_labels.OTHERS})
     if unusual:
-        print(f"note: clips of kind {', '.join(unusual)} should raise no alarm; see to the spelling", file=sys.stderr)
+        print(f"note: clips of kind {', '.join(unusual)} should raise no alarm; check the spelling", file=sys.stderr)
     return folder, labels
 
 
@@ -92,7 +92,7 @@ def _choose(given: Sequence[str]) -> list[str]:
         if stimulus_scores.find(name).is_ideal:
             choices = ", ".join(seeing)
             raise InputError(
-                f"expected detectors that see, got {name}, which is told the geometry; choose from {choices}"
+                f"expected detectors of frames, got {name}, which is given the geometry; choose from {choices}"
             )
     return names
 

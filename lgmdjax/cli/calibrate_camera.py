@@ -1,4 +1,4 @@
-"""`lgmdjax calibrate-camera`: a lens from pictures of a chessboard, and a picture of what is left of straight lines."""
+"""`lgmdjax calibrate-camera`: fit a lens to pictures of a chessboard, and plot how far straight lines still bend."""
 
 from collections.abc import Iterator
 
@@ -19,7 +19,7 @@ def calibrate(flags: CalibrateCameraFlags) -> Iterator[str]:
         raise InputError(f"expected --out with a name that ends in {', '.join(SUFFIXES)}, got {flags.out}; rename it")
     if not flags.folder.is_dir():
         raise InputError(
-            f"expected a folder with pictures of a chessboard, got {flags.folder}, which is none; name another"
+            f"expected a folder with pictures of a chessboard, got {flags.folder}, which is not a folder; give another"
         )
     board = chessboard.parse_board(flags.board, flags.square)
     found = chessboard.calibrate(flags.folder, board, flags.model)
@@ -28,8 +28,8 @@ def calibrate(flags: CalibrateCameraFlags) -> Iterator[str]:
     lens.write(flags.out, found.lens)
     left = np.rad2deg(chessboard.bends(found))
     yield f"{len(found.used)} pictures used, {len(found.unused)} without the whole board"
-    yield f"corners are {found.error:.2f} px beside where the lens puts them (root mean square)"
+    yield f"corners deviate by {found.error:.2f} px from where the lens maps them (root mean square)"
     mean = np.sqrt(np.mean(left**2))
-    yield f"rows are straight to {mean:.3f} degrees (root mean square), {np.abs(left).max():.3f} at most"
+    yield f"rows of corners bend by {mean:.3f} degrees (root mean square), {np.abs(left).max():.3f} at most"
     yield str(flags.out)
     yield str(flags.out.with_suffix(".png"))

@@ -1,4 +1,4 @@
-"""`lgmdjax doctor`: check whether this machine computes what it should; one line for each check, OK, WARN or FAIL."""
+"""`lgmdjax doctor`: check that this machine computes correctly; one line for each check: OK, WARN or FAIL."""
 
 import io
 import os
@@ -186,7 +186,7 @@ def disk(out: Path) -> Finding:
 
 
 def folder(out: Path) -> Finding:
-    """Check that files can be written to the folder, or to the one that it would be made in."""
+    """Check that files can be written to the folder, or to its nearest existing parent."""
     parent = _existing_parent(out)
     try:
         with tempfile.TemporaryFile(dir=parent):

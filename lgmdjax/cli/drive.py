@@ -61,18 +61,18 @@ def drive(flags: DriveFlags) -> int:
                     seconds=flags.seconds or math.inf,
                 )
             except BusLost as error:
-                raise InputError(f"expected servos that say where they are, got {error}; check cables") from error
+                raise InputError(f"expected servos that report their positions, got {error}; check cables") from error
             return _run(flags, driver)
 
 
 def _run(flags: DriveFlags, driver: Driver) -> int:
-    """Run a driver, print what came of it, and return the exit code."""
+    """Run a driver, print the result, and return the exit code."""
     reason = driver.run().reason or Reason.STOPPED
     print(driver.timing.describe() + (f", on a clock at {flags.speed:g}" if flags.speed < 1 else ""))
     print(f"bus: {driver.bus.answered} answers, {driver.bus.failed} missing or garbled", flush=True)
     if driver.holding:
         held = ", ".join(map(str, driver.holding))
-        print(f"lgmdjax: servos {held} did not say that they let go: switch their power off", file=sys.stderr)
+        print(f"lgmdjax: servos {held} did not confirm that torque is off: switch off their power", file=sys.stderr)
     if reason in ORDERLY and not driver.holding:
         return 0
     silent = driver.bus.silent_servos()
@@ -82,7 +82,7 @@ def _run(flags: DriveFlags, driver: Driver) -> int:
 
 
 def _connect(bus: ServoBus, servos: JointMap, path: Path) -> None:
-    """Find all servos of the map and give them their limits; raise `InputError` if one is missing."""
+    """Find all servos of the map and set their limits; raise `InputError` if one is missing."""
     try:
         missing = set(servos.ids)
         for _ in range(servo_bus.CONNECT_ATTEMPTS):

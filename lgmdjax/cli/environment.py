@@ -7,7 +7,7 @@ from lgmdjax.runtime import jax_setup
 
 
 def check_jax() -> None:
-    """Make JAX check what it reads from its cache; raise `InputError` for variables that JAX can't be started with."""
+    """Make JAX check what it reads from its cache; raise `InputError` for variables with which JAX can't start."""
     jax_setup.check_variables()
     from lgmdjax.runtime import program_cache
 
@@ -20,14 +20,14 @@ def check() -> None:
     for name, start in LIBRARIES.items():
         try:
             start()
-        except Exception as error:  # whatever a library makes of a variable that it does not understand
+        except Exception as error:  # a library may raise anything for a variable that it can't read
             reason, variables = one_line(error)[:300] or type(error).__name__, jax_setup.user_variables()
-            advice = f"change or unset {variables}" if variables else "install lgmdjax and what it needs again"
+            advice = f"change or unset {variables}" if variables else "reinstall lgmdjax and its dependencies"
             raise InputError(f"expected an environment in which {name} starts, got {reason}; {advice}") from error
 
 
 def explain(error: Exception) -> str:
-    """Return what is wrong with the environment; empty if it is not the environment that an error comes from."""
+    """Return what is wrong with the environment; empty if the error has another cause."""
     if type(error).__name__ == "JaxRuntimeError" and "RESOURCE_EXHAUSTED" in str(error):
         return f"expected more memory, got {one_line(error)[:200]}; run fewer robots at once"
     if isinstance(error, RuntimeError) and "start new thread" in str(error):

@@ -50,7 +50,7 @@ class PipelineFlags:
     name: str = ""
     """name of the run folder; if empty, <scale>-<seed> and each setting that is changed: quick-0_train.epochs=200"""
     track: str = ""
-    """who gets the curves of fits: tensorboard, or module:function of your own log(step, values)"""
+    """log of the curves of fits: tensorboard, or module:function for your own log(step, values)"""
     settings: Annotated[Mapping[str, object], tyro.conf.arg(name="")]
 
 
@@ -67,7 +67,7 @@ class StudyFlags:
     name: str = ""
     """name of the study's folder; if empty, <study>-<seed> and each setting that is changed: velocity-0_robots=4"""
     track: str = ""
-    """who gets the curves of fits: tensorboard, or module:function of your own log(step, values)"""
+    """log of the curves of fits: tensorboard, or module:function for your own log(step, values)"""
     settings: object
 
 
@@ -78,13 +78,13 @@ class TrialFlags:
     trials: tyro.conf.Positional[tuple[TrialName, ...]]
     """trials of the paper"""
     policy: tuple[PolicyName | Literal["all"], ...] = ("learned",)
-    """policies that are compared; all stands for the five"""
+    """policies to compare; all means all five"""
     seed: int = 0
-    """seed of rooms, textures and starts"""
+    """seed of rooms, textures and start poses"""
     seeds: int | None = None
-    """number of seeds; if left out that of the trial, which is the number of the paper's repetitions or more"""
+    """number of seeds; if left out that of the trial, which is at least the paper's number of repetitions"""
     width: int | None = None
-    """width of the pictures [px], 320 in the paper; if left out that of the robot's training, with similar results"""
+    """width of the pictures [px], 320 in the paper; if left out as in the robot's training, with similar results"""
     run: Path | None = None
     """run folder of the robot; the pretrained robot if left out"""
     out: Path = Path("runs/trials")
@@ -100,12 +100,12 @@ class TrialFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class AlarmFlags:
-    """When a response that rises is an alarm."""
+    """When a rising response counts as an alarm."""
 
     threshold: float = 0.6
-    """adapted response of either eye, from 0.5 (no rise) to 1; 0.6 is half as much again as in the last seconds"""
+    """adapted response of an eye, from 0.5 (no rise) to 1; 0.6 means 1.5 times the excitation of the last seconds"""
     persistence: float = 0.1
-    """how long it has to last [s]"""
+    """how long the response must stay above the threshold [s]"""
     exit_code: tyro.conf.FlagCreatePairsOff[bool] = False
     """end with exit code 3 if there is an alarm, for scripts"""
 
@@ -117,7 +117,7 @@ class WatchFlags:
     video: tyro.conf.Positional[str]
     """any video that FFmpeg reads, or a live source: /dev/video0, tcp://, rtsp:// or http://..., a pipe, /dev/stdin"""
     seconds: float = 60.0
-    """how long a live source is watched, if it does not end before; a file is watched to its end"""
+    """how long a live source is watched, unless it ends earlier; a file is watched to its end"""
     stereo: Literal["side-by-side"] | None = None
     """each frame holds the pictures of the left and the right eye, side by side"""
     mono: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -127,15 +127,15 @@ class WatchFlags:
     table: Literal["csv", "parquet"] = "csv"
     """file format of the responses, one row for each frame"""
     overlay: bool = True
-    """write the video with the responses drawn over it; more than twice as fast without"""
+    """write the video with the responses drawn over it; without it the command is more than twice as fast"""
     overlap: float = 0.5
     """fraction of its picture's width that each eye sees, from 0.5 (its half) to 1 (all of it)"""
     ground: float = 0.0
     """fraction of its picture's height, at the bottom, that no eye sees"""
     falloff: float = 0.0
-    """how much less cells weigh beside the way than ahead; 2 in the pretrained robot, 0 is not at all"""
+    """how much less weight cells have at the side than ahead; 2 in the pretrained robot, 0 for equal weights"""
     fov: float = 170.0
-    """horizontal field of view of a picture [deg], by which --falloff knows what is beside the way"""
+    """horizontal field of view of a picture [deg], which --falloff needs for the bearings of the cells"""
     pooling: int = 1
     """width of a detector's cell [px]"""
     width: int = 320
@@ -151,14 +151,14 @@ class WatchFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchFlags:
-    """What detectors are compared on, and which."""
+    """The stimuli or clips, and the detectors that are compared on them."""
 
     on: tyro.conf.Positional[Literal["stimuli", "clips"]]
     """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos"""
     paths: tyro.conf.Positional[tuple[Path, ...]] = ()
     """with clips, the folder of the videos, and the file of their labels if it is not labels.csv in that folder"""
     detector: tuple[str, ...] = ("all",)
-    """detectors by name, or module:attribute for one of your own; all stands for those of lgmdjax.detectors"""
+    """detectors by name, or module:attribute for one of your own; all means those of lgmdjax.detectors"""
     scale: BenchScale = "quick"
     """smoke runs in seconds, quick in a minute, paper has l/|v| from 10 ms to 2 s"""
     seed: int = 0
@@ -174,14 +174,14 @@ class ExportFlags:
     robot: tyro.conf.Positional[Path]
     """run folder of the robot, or the word pretrained for the one that comes with the package"""
     out: tyro.conf.Positional[Path]
-    """folder to write, which must be empty or missing"""
+    """folder to write; it must be empty or not exist"""
     width: int | None = None
-    """width of the pictures [px], 320 in the paper; if left out that of the robot's training"""
+    """width of the pictures [px], 320 in the paper; if left out as in the robot's training"""
     formats: tuple[Format, ...] = FORMATS
     """programs to write; onnx needs the extra `onnx`"""
 
     def run(self) -> Path | None:
-        """Return the run folder; None stands for the pretrained robot."""
+        """Return the run folder; None means the pretrained robot."""
         return None if self.robot == Path(PRETRAINED) else self.robot
 
 
@@ -192,13 +192,13 @@ class DatasetFlags:
     run: tyro.conf.Positional[Path]
     """run folder, whose teacher's walks are exported; or any folder with recorded walks, such as that of a trial"""
     out: tyro.conf.Positional[Path]
-    """folder to write, which must be empty or missing"""
+    """folder to write; it must be empty or not exist"""
     format: DatasetFormat = "lerobot"
     """lerobot is LeRobotDataset v3.0; the others are plain tables and arrays"""
     video: bool = False
     """render both eyes' pictures again from the poses, for lerobot (H.264) and zarr (without loss)"""
     licence: str = "Apache-2.0"
-    """licence that you give the data, by its name in the SPDX list; it stands in the card"""
+    """licence of the data, by its SPDX identifier; the card names it"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,7 +206,7 @@ class DemoFlags:
     """Where the page is served."""
 
     host: str = "127.0.0.1"
-    """address to listen on; the default is reached from this machine alone"""
+    """address to listen on; with the default only this machine can connect"""
     port: int = 8080
     """port to listen on; 0 takes a free one"""
     browser: bool = True
@@ -238,7 +238,7 @@ class DoctorFlags:
 
 
 NEED_RUN = ("sensitivity", "overlap", "lgmd_gradient")
-"""Studies of recorded walks, which the pretrained robot has none of."""
+"""Studies that read recorded walks; the pretrained robot has none."""
 
 
 def parse_pipeline(command: str, description: str, arguments: Sequence[str]) -> PipelineFlags:
@@ -250,7 +250,7 @@ def parse_pipeline(command: str, description: str, arguments: Sequence[str]) -> 
     check_settings(settings)
     for flag, value in changed_settings(preset, settings).items():
         if flag.endswith(".trial"):
-            raise InputError(f"expected --{flag} as it is, got {value}; change the settings of another trial")
+            raise InputError(f"expected --{flag} unchanged, got {value}; use the flags of the other trial instead")
     name = flags.name or name_run(f"{flags.scale}-{flags.seed}", preset, settings)
     return replace(flags, name=name, settings=settings)
 
@@ -330,7 +330,7 @@ def changed_settings(preset: object, settings: object, flag: str = "") -> dict[s
 
 
 def name_run(prefix: str, preset: object, settings: object) -> str:
-    """Return the default name of a run folder, which tells its changed settings.
+    """Return the default name of a run folder, which lists its changed settings.
 
     >>> name_run("quick-0", {"report": 1.0}, {"report": 2.0})
     'quick-0_report=2'
@@ -378,12 +378,12 @@ def _format(value: object) -> str:
 
 
 def _keep_preset(preset: object, settings: object) -> object:
-    """Return the preset if the settings are equal to it: 10.0 for 10 would be hashed as another setting."""
+    """Return the preset if the settings are equal to it, because 10.0 and 10 would have different hashes."""
     return preset if settings == preset else settings
 
 
 def _read_scale(arguments: Sequence[str]) -> Scale:
-    """Return the scale among the arguments; its default for one that does not exist, which tyro then refuses."""
+    """Return the scale among the arguments, or the default for an unknown scale, which tyro then rejects."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--scale", nargs="?")
     found = parser.parse_known_args(arguments)[0].scale

@@ -16,21 +16,21 @@ RoomName = Literal["testing", "training", "indoor", "outdoor", "random", "empty"
 
 @dataclass(frozen=True, kw_only=True)
 class DriveFlags:
-    """The robot's plugs, and what drives it."""
+    """The robot's cameras and ports, and the nervous system that drives it."""
 
     camera: tuple[str, ...]
-    """a source with both eyes side by side, or those of the left and the right eye: /dev/video0, tcp://..., rtsp://...,
-    http://..., a pipe or a file"""
+    """one source with both eyes side by side, or one source for the left and one for the right eye: /dev/video0,
+    tcp://..., rtsp://..., http://..., a pipe or a file"""
     servos: str
-    """serial port of the servos, as /dev/ttyUSB0"""
+    """serial port of the servos, such as /dev/ttyUSB0"""
     map: Path = Path("servos.toml")
-    """which servo is which joint (`lgmdjax servos map` makes it)"""
+    """file that says which servo is which joint (`lgmdjax servos map` writes it)"""
     robot: Path = Path(PRETRAINED)
     """run folder of the robot whose nervous system drives, or the word pretrained"""
     calibration: tuple[Path, ...] = ()
-    """calibrated lens of the cameras, or those of the left and the right one (`lgmdjax calibrate-camera` makes them)"""
+    """lens of both cameras, or one of the left and one of the right (`lgmdjax calibrate-camera` writes the files)"""
     mono: tyro.conf.FlagCreatePairsOff[bool] = False
-    """the camera is one picture, of which each eye sees its side"""
+    """the camera sends one picture, of which each eye sees its side"""
     imu: str | None = None
     """serial port of an inertial sensor that sends lines of three numbers: acceleration forward, left, up"""
     seconds: float | None = None
@@ -40,19 +40,19 @@ class DriveFlags:
     name: str = ""
     """name of the log's folder; date and time if empty"""
     speed: float = 1.0
-    """seconds of the robot for each second; below 1 for a simulated robot that is as slow"""
+    """seconds of robot time per real second; below 1 for a simulated robot that is as slow"""
 
     def run(self) -> Path | None:
-        """Return the run folder; None stands for the pretrained robot."""
+        """Return the run folder; None means the pretrained robot."""
         return None if self.robot == Path(PRETRAINED) else self.robot
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimRobotFlags:
-    """The room of the simulated robot, and where its plugs are."""
+    """The room of the simulated robot, and its ports."""
 
     room: RoomName = "testing"
-    """the room that it stands in"""
+    """room of the robot"""
     seed: int = 0
     """seed of the room's textures, and of random rooms"""
     port: int = 5600
@@ -62,16 +62,16 @@ class SimRobotFlags:
     out: Path = Path("runs/sim-robot")
     """folder for its joint map servos.toml, trace.csv, and the links bus and imu to its pseudo-terminals"""
     fault: tuple[str, ...] = ()
-    """faults from the start; lines on stdin switch others on and `clear` all off"""
+    """faults from the start on; a line on stdin adds another one, `clear` ends all"""
     seconds: float | None = None
     """how long it runs; until Ctrl-C if left out"""
     speed: float = 1.0
-    """seconds of the robot for each second; below 1 on a busy computer"""
+    """seconds of robot time per real second; below 1 on a busy computer"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateCameraFlags:
-    """Pictures of a chessboard, and what is made of them."""
+    """Pictures of a chessboard, and the lens that is fitted to them."""
 
     folder: tyro.conf.Positional[Path]
     """folder with ten or more pictures (PNG, JPEG, ...) of one chessboard, from all sides and in all corners"""
@@ -82,23 +82,23 @@ class CalibrateCameraFlags:
     model: Literal["fisheye", "pinhole"] = "fisheye"
     """fisheye for lenses over 100 degrees wide, else pinhole"""
     out: Path = Path("camera.json")
-    """file to write, .json, or .yaml as OpenCV writes it; the picture beside it ends in .png"""
+    """file to write: .json, or .yaml as OpenCV writes it; a plot beside it ends in .png"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServosMapFlags:
-    """The bus whose servos are named."""
+    """The bus whose servos are mapped."""
 
     servos: str
-    """serial port of the servos, as /dev/ttyUSB0"""
+    """serial port of the servos, such as /dev/ttyUSB0"""
     out: Path = Path("servos.toml")
     """file to write"""
     baud: int = 1_000_000
     """bits per second"""
     highest_id: int = 30
-    """servos are looked for from 0 to this id; at most 252"""
+    """highest id that is tried, from 0 on; at most 252"""
     speed: float = 1.0
-    """seconds of the robot for each second; below 1 for a simulated robot that is as slow"""
+    """seconds of robot time per real second; below 1 for a simulated robot that is as slow"""
 
 
 def parse_drive(description: str, arguments: Sequence[str]) -> DriveFlags:
@@ -132,5 +132,5 @@ def parse_servos_map(description: str, arguments: Sequence[str]) -> ServosMapFla
     """Read the flags of command servos map."""
     given = flags.parse(ServosMapFlags(servos=tyro.MISSING), "servos map", description, arguments)
     if not 0 <= given.highest_id <= 252:
-        raise InputError(f"expected --highest-id of 0 to 252, got {given.highest_id}; robots are numbered from 1")
+        raise InputError(f"expected --highest-id of 0 to 252, got {given.highest_id}; servos are numbered from 1")
     return given

@@ -29,7 +29,7 @@ NOT_RESUMED = (
     "doctor",
 )  # fmt: skip
 ALARM_CODE = 3  # exit code of `lgmdjax watch --alarm.exit-code` after an alarm
-MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help: in narrower terminals tyro does not come to an end
+MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help; tyro does not terminate in narrower terminals
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
 
 
@@ -87,7 +87,7 @@ def study(arguments: Sequence[str]) -> None:
     environment.check_jax()
     from lgmdjax.cli.study import run_study
 
-    print(f"look into {run_study(name, given)}")
+    print(f"results in {run_study(name, given)}")
 
 
 def watch(arguments: Sequence[str]) -> int:
@@ -129,7 +129,7 @@ def export_dataset(arguments: Sequence[str]) -> None:
 
 
 def drive(arguments: Sequence[str]) -> int:
-    """Let a robot walk: its nervous system between a live camera and servos (extra `drive`)."""
+    """Drive a robot by its nervous system, from live cameras to servos (extra `drive`)."""
     from lgmdjax.cli import hardware_flags
 
     given = hardware_flags.parse_drive(_summary(drive), arguments)
@@ -164,7 +164,7 @@ def servos(arguments: Sequence[str]) -> None:
 
 
 def sim_robot(arguments: Sequence[str]) -> None:
-    """Play a robot in a room: servos on a pseudo-terminal, eyes as a stream of pictures."""
+    """Simulate a robot in a room: servos on a pseudo-terminal, eyes as a stream of pictures."""
     from lgmdjax.cli import hardware_flags
 
     given = hardware_flags.parse_sim_robot(_summary(sim_robot), arguments)
@@ -297,9 +297,9 @@ def _run(given: Sequence[str]) -> int | None:
 
 @contextlib.contextmanager
 def _writable_output() -> Iterator[None]:
-    """Let every text be printed, whatever the encoding; raise `OSError` at the end if output cannot be written.
+    """Make every text printable in any encoding; raise `OSError` at the end if output cannot be written.
 
-    Names of files that are not text in the encoding of stdout are printed byte by byte as they are.
+    File names that are not valid in the encoding of stdout are printed as their original bytes.
     """
     codecs.register_error("lgmdjax-names", _replace_by_bytes)
     for stream, errors in ((sys.stdout, "lgmdjax-names"), (sys.stderr, "backslashreplace")):
@@ -311,7 +311,7 @@ def _writable_output() -> Iterator[None]:
         try:
             sys.stdout.flush()
         except OSError:
-            with contextlib.suppress(OSError):  # what is left to print must not fail again when Python ends
+            with contextlib.suppress(OSError):  # when Python exits, printing the rest must not fail again
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise
 
@@ -331,7 +331,7 @@ def _complain(line: str, code: int) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that does not hide that its help could not be printed."""
+    """A parser that raises an error if its help cannot be printed."""
 
     def _print_message(self, message: str, file: IO[str] | None = None) -> None:
         (file or sys.stderr).write(message or "")

@@ -1,4 +1,4 @@
-"""`lgmdjax servos map`: find out which servo is which joint, together with the user, and write the joint map."""
+"""`lgmdjax servos map`: ask the user which servo is which joint, and write the joint map."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""`lgmdjax sim-robot`: a process that plays the robot, to try `lgmdjax drive` before one owns any."""
+"""`lgmdjax sim-robot`: a process that simulates the robot, to try `lgmdjax drive` without hardware."""
 
 import contextlib
 import math
@@ -32,22 +32,22 @@ ROOMS: Mapping[RoomName, Callable[[jax.Array], Arena]] = {
 
 
 def run_robot(flags: SimRobotFlags) -> None:
-    """Play the robot until the time is up or Ctrl-C."""
+    """Simulate the robot until the time is up or Ctrl-C."""
     for fault in flags.fault:
         if fault not in FAULTS:
-            raise InputError(f"expected a --fault, got {fault}; choose from {', '.join(FAULTS)}")
+            raise InputError(f"expected a known --fault, got {fault}; choose from {', '.join(FAULTS)}")
     with jax.enable_x64(False), contextlib.ExitStack() as stack:
         robot = _assemble(flags, stack)
         robot.renderer.compile(robot.body.pose())
         print(f"servos: {flags.out / 'bus'} ({robot.bus.name}), joint map {flags.out / 'servos.toml'}")
         print(f"camera: {robot.eyes.address}")
         print(f"inertial sensor: {flags.out / 'imu'} ({robot.inertial.name})")
-        print(f"faults that stdin understands: {', '.join(FAULTS)}; clear", flush=True)
+        print(f"faults that can be typed on stdin: {', '.join(FAULTS)}; clear", flush=True)
         robot.run(flags.seconds or math.inf, sys.stdin.fileno())
 
 
 def _assemble(flags: SimRobotFlags, stack: contextlib.ExitStack) -> SimulatedRobot:
-    """Open the plugs of a robot, write its joint map, and link its pseudo-terminals."""
+    """Open the ports of a robot, write its joint map, and link its pseudo-terminals."""
     room = jax.jit(ROOMS[flags.room])(jax.random.key(flags.seed))
     servos = joint_map.default()
     bank, eye = Bank(servos.ids), camera.Params(width=flags.width, height=flags.width * 3 // 4)

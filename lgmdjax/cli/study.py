@@ -1,4 +1,4 @@
-"""`lgmdjax study`: one study by itself, with the pretrained robot or with that of a run."""
+"""`lgmdjax study`: one study, with the pretrained robot or with the robot of a run."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ from lgmdjax.studies import (
 
 
 class Study(Protocol):
-    """What each module of `lgmdjax.studies` has."""
+    """The interface of the modules of `lgmdjax.studies`."""
 
     run: Callable[..., None]
     plot: Callable[[Sequence[JsonObject]], Figure]

@@ -1,4 +1,4 @@
-"""`--track`: who gets the curves of fits, TensorBoard or a function `log(step, values)` of the user's."""
+"""`--track`: log the curves of fits to TensorBoard or to a function `log(step, values)` of the user."""
 
 import contextlib
 from collections.abc import Iterator, Mapping
@@ -13,7 +13,7 @@ FOLDER = "tensorboard"  # in the run folder
 
 
 def check(track: str) -> None:
-    """Raise `InputError` for a --track that leads to nothing; an empty one tracks nothing."""
+    """Raise `InputError` for a --track that names no log; an empty one is allowed."""
     if track == TENSORBOARD:
         if find_spec("tensorboardX") is None:
             raise InputError(
@@ -26,7 +26,7 @@ def check(track: str) -> None:
 
 @contextlib.contextmanager
 def following(track: str, run: Path) -> Iterator[None]:
-    """Pass the curves of fits to whom `track` names: nobody if empty, event files in a run folder, or a function."""
+    """Log the curves of fits as `track` says: not at all if empty, to event files in a run folder, or to a function."""
     check(track)
     if not track:
         yield
@@ -56,7 +56,7 @@ def _find(track: str) -> tracking.Log:
 
 
 def _explaining(log: tracking.Log, name: str) -> tracking.Log:
-    """Return the user's function with its errors as one line; the run can be resumed without it."""
+    """Return the user's function, with its exceptions as one-line errors; the run can be resumed without it."""
 
     def explained(step: int, values: Mapping[str, float]) -> None:
         try:
@@ -64,7 +64,7 @@ def _explaining(log: tracking.Log, name: str) -> tracking.Log:
         except Exception as error:  # whatever the user's function raises
             reason = one_line(f"{type(error).__name__}: {error}")[:200]
             raise InputError(
-                f"expected {name} to take step {step}, got {reason}; mend it, or leave --track out"
+                f"expected {name} to take step {step}, got {reason}; fix it, or leave --track out"
             ) from error
 
     return explained

@@ -15,11 +15,11 @@ def run_trials(flags: TrialFlags) -> Iterator[str]:
             folder = run_trial.run_trial(
                 trial, policy, seed=flags.seed, seeds=flags.seeds, width=flags.width, run=flags.run, out=flags.out
             )
-            yield f"{trial}, {policy}: {describe(storage.read_table(folder / 'outcome.json'))}; look into {folder}"
+            yield f"{trial}, {policy}: {describe(storage.read_table(folder / 'outcome.json'))}; results in {folder}"
 
 
 def describe(outcome: JsonObject) -> str:
-    """Describe the outcome of a trial in a line.
+    """Return the outcome of a trial as one line.
 
     >>> progress = {"coverage": {"value": 18.21}}
     >>> describe({"per_100_m": {"value": 7.3}, "collisions": 3, "distance": 41.2, "progress": progress})

@@ -1,4 +1,4 @@
-"""`lgmdjax watch`: the two LGMDs on a video of the user, read and written frame by frame.
+"""`lgmdjax watch`: run the two LGMDs on a video, which is read and written frame by frame.
 
 Writes to a folder with the full name of the video:
 
@@ -39,7 +39,7 @@ from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import hemifield
 from lgmdjax.sensors.settings import check_field
 
-MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third is the first with all of it
+MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third frame is the first with full inhibition
 MIN_SIZE = 16  # px, smallest width and height of the picture of an eye
 NOMINAL_RATE = 30  # Hz, of the robot's cameras
 
@@ -55,7 +55,7 @@ class StereoLayout:
 
 
 class Watched(NamedTuple):
-    """What was written, and what was seen."""
+    """The files written, and the alarms."""
 
     files: list[Path]
     alarms: list[JsonObject]  # with start and end [s]
@@ -67,7 +67,7 @@ def watch_video(flags: WatchFlags) -> Watched:
         raise InputError("expected --mono or --stereo, got both; leave one out")
     if live_source.is_live(flags.video):
         if not flags.seconds > 0:
-            raise InputError(f"expected --seconds above 0, got {flags.seconds:g}; a live source is watched for so long")
+            raise InputError(f"expected --seconds above 0, got {flags.seconds:g}; a live source is watched that long")
         name, reader = live_source.file_name(flags.video), live_source.open_reader(flags.video, flags.seconds)
     else:
         name = os.path.expanduser(flags.video)
@@ -80,7 +80,7 @@ def watch_video(flags: WatchFlags) -> Watched:
 
 
 def _settings(flags: WatchFlags) -> tuple[StereoLayout, Detectors]:
-    """Return what the flags say of the picture, the detectors and the alarm; raise InputError if they cannot be."""
+    """Return the layout, and the constants of detectors and alarm; raise InputError for impossible ones."""
     given = {name: getattr(flags, name) for name in lgmd.SCALARS}
     check_field(overlap=flags.overlap, ground=flags.ground, falloff=flags.falloff)
     if not 0 < flags.fov <= 360:
@@ -127,7 +127,7 @@ def detect_in(
     table: TableFormat = "csv",
     overlay: bool = True,
 ) -> Watched:
-    """Run both detectors on an open video; arguments, files and errors as of `detect_looming`."""
+    """Run both detectors on an open video; arguments, files and errors as for `detect_looming`."""
     lgmd.check(params.lgmd)
     alarm.check(params.alarm)
     folder = out / path.name
@@ -157,19 +157,19 @@ def detect_in(
 
 
 def _print_notes(path: Path, video: video_io.Video) -> None:
-    """Print on stderr what the user should know of the video, and do about it."""
+    """Print notes on stderr about a video that may need other settings or a repair."""
     ratio = NOMINAL_RATE / float(video.rate)
     if not 0.8 < ratio < 1.25:
         scaled = [f"--{name} {ratio * getattr(lgmd.Params, name):.3g}" for name in ("threshold", "suppression")]
         print(
-            f"note: {float(video.rate):.3g} frames a second; T_s and T_f are meant for the changes of "
+            f"note: {float(video.rate):.3g} frames a second; T_s and T_f are meant for changes over "
             f"1/{NOMINAL_RATE} s: try {' '.join(scaled)}, or convert to {NOMINAL_RATE} frames a second",
             file=sys.stderr,
         )
     if video.left_out:
         print(
             f"note: {path} begins between two key frames or with damage: {video.left_out} packets before the first "
-            "whole frame are left out; look whether the beginning matters",
+            "whole frame are left out; check whether the beginning matters",
             file=sys.stderr,
         )
 
@@ -191,7 +191,7 @@ def _scaled_size(path: Path, video: video_io.Video, layout: StereoLayout) -> tup
     height = round(full_height * width / full_width)
     if min(width, height) < MIN_SIZE:
         raise InputError(
-            f"expected pictures of {MIN_SIZE} px or more either way, got {width} x {height} from {path}; "
+            f"expected pictures of {MIN_SIZE} px or more in width and height, got {width} x {height} from {path}; "
             "raise --width, or give a larger video"
         )
     return pictures * width, height
@@ -220,7 +220,7 @@ def _step(
 ) -> tuple[States, Float[Array, "5 2"], lgmd.Layers]:
     """Return the next states, u, FF, excitation, adapted response and alarm of both eyes, and the layers.
 
-    The layers are also returned without an overlay: another program would round u otherwise.
+    The layers are returned even without an overlay, because a program without them would round u differently.
     """
     seen, adapting = states
     ordered = _outermost_first(params.lgmd, pictures)
@@ -235,7 +235,7 @@ def _step(
 
 
 def _outermost_first(params: lgmd.Params, pictures: Float[Array, "2 rows columns"]) -> Float[Array, "2 rows columns"]:
-    """Mirror the right picture if its columns have weights; without, u would round otherwise than before."""
+    """Mirror the right picture if its columns have weights; without them this would only change the rounding of u."""
     return hemifield.outermost_first(pictures) if params.falloff else pictures
 
 
@@ -272,7 +272,7 @@ def _respond(
 ) -> Iterator[tuple[lgmd_overlay.ResponseSample, tuple[float, float], np.ndarray, lgmd.Layers]]:
     """Yield responses, excitations, pictures and layers of each frame.
 
-    The detectors start from the first frame, so that nothing has changed in it.
+    The detectors start from the first frame, in which nothing has changed.
     """
     states = None
     for frame in frames:

@@ -1,4 +1,4 @@
-"""Files of `lgmdjax watch` but for the overlay: table, plot, and list of alarms."""
+"""Files of `lgmdjax watch` except the overlay: table, plot, and list of alarms."""
 
 import json
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ UNITS = {
 
 
 class Detectors(NamedTuple):
-    """Constants of what runs on each eye; the alarm's frame time is that of the video."""
+    """Constants of the detector and the alarm of each eye; the alarm's frame time is that of the video."""
 
     lgmd: lgmd.Params
     alarm: alarm.Params
@@ -49,10 +49,10 @@ def write_files(
     """Write table, plot and list of alarms to a folder, and return the alarms.
 
     Args:
-        folder: which exists.
+        folder: existing folder.
         seen: responses of all frames.
         params: of the detectors.
-        facts: what the metadata say besides: `video`, `rate` [frames a second], `eyes`.
+        facts: further metadata: `video`, `rate` [frames a second], `eyes`.
         table: format of the table.
     """
     constants = {name: float(getattr(params.lgmd, name)) for name in lgmd.SCALARS}
@@ -68,7 +68,7 @@ def write_files(
 
 
 def list_alarms(samples: Sequence[lgmd_overlay.ResponseSample], frame_time: float) -> list[JsonObject]:
-    """Return start and end [s] of every alarm, and the largest adapted response in it; short gaps are none.
+    """Return start and end [s] of every alarm, and the largest adapted response in it; a short gap does not end it.
 
     >>> first = lgmd_overlay.ResponseSample(0.0, (0.9, 0.5), (1.0, 1.0), (0.8, 0.4), is_alarm=True)
     >>> list_alarms([first, first._replace(time=0.1, is_alarm=False)], 0.1)

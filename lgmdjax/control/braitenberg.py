@@ -16,8 +16,8 @@ nearness of what is in its way on either side to the sum of vehicles 2a and 3b (
 
 Source: Cizek & Faigl, sec. 4.1, 4.2; Braitenberg 1986. Pairs are (left, right); v_right > v_left turns left.
 
-`rule` is eq. 22 as printed. It turns away from whatever is nearest, also beside its way, so that it turns round where
-it could pass. It commands velocities that no gait can reach. In front of a flat wall both sides are equally near, so it
+`rule` is eq. 22 as printed. It turns away from whatever is nearest, even beside its path, and so turns back where it
+could pass. It commands velocities that no gait can reach. In front of a flat wall both sides are equally near, so it
 accelerates into the wall. `step` therefore departs from it in three ways:
 
 1. `sensed_distances` weighs what is in the way (`lgmdjax.sensors.laser`) more than what is merely near.
@@ -34,7 +34,7 @@ paper's scenes of 90 s, and in 64 random rooms of 180 s:
 
 In the three scenes 3 of the 62 robots with the paper's rule touch nothing.
 
-Gradient: exact almost everywhere; zero by the direction of the turn.
+Gradient: exact almost everywhere; zero through the direction of the turn.
 """
 
 import math
@@ -61,7 +61,7 @@ class Params(Shown):
     single vehicle.
     """
 
-    base: Scalar = 1.3  # v_base; the paper has 1.2 (its "m/s" are multiples of nominal), and 1.0 to 1.4 as equally good
+    base: Scalar = 1.3  # v_base; paper: 1.2 (its "m/s" are multiples of nominal), with 1.0 to 1.4 equally good
     gain_2a: Scalar = 0.8  # k_2a
     gain_3b: Scalar = 0.6  # k_3b
     min_velocity: Scalar = MIN_VELOCITY  # range of the gait
@@ -118,7 +118,7 @@ def rule(params: Params, distances: Float[Array, "2"]) -> Float[Array, "2"]:
 
 
 def limit(params: Params, velocity: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Bring a velocity into the range of the gait and keep the turn: shift both sides first, narrow the turn after.
+    """Bring a velocity into the range of the gait and keep the turn: first shift both sides, then narrow the turn.
 
     Clipping each side by itself would lose most of the turn where it is needed most. The velocity (3.75, -0.64) belongs
     to an obstacle 0.3 m away on the left:
@@ -135,12 +135,12 @@ def limit(params: Params, velocity: Float[Array, "2"]) -> Float[Array, "2"]:
 def sensed_distances(params: Params, nearest: Float[Array, "2"], corridor: Float[Array, "2"]) -> Float[Array, "2"]:
     """Return the distances [m] that the rule reacts to, on either side.
 
-    Their nearness is a mean of that of what is in the way (e) and of what is nearest (d), with weight `corridor`:
+    Their nearness 1/r is the mean of the nearness of what is in the way (e) and of what is nearest (d), with weights:
 
         1/r = corridor / e + (1 - corridor) / d.
 
-    What is nearest decides the side where both sides of the way are equally closed: beside a wall the robot turns away
-    from it, not into it.
+    Where the path is equally blocked on both sides, what is nearest decides the side: beside a wall the robot turns
+    away from it, not into it.
 
     Args:
         params: of the rule.

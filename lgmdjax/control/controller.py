@@ -1,8 +1,8 @@
 """The robot's controller: stereo frame in, eighteen joint targets out.
 
 Two LGMDs process the two hemifields, a policy turns their outputs into a left and right velocity, and the output of
-the CPG, shaped for that velocity, becomes joint angles. There are two rates: `detect` and `decide` run once a camera
-frame, `move` once a physics substep. `step` composes them for a robot whose only sensor is the camera.
+the CPG, shaped for that velocity, becomes joint angles. There are two rates: `detect` and `decide` run once per camera
+frame, `move` once per physics substep. `step` composes them for a robot whose only sensor is the camera.
 
 The policy is an argument (`lgmdjax.control.policies`), so that the learned navigator and the policies that it is
 compared with share the same detectors and gait.
@@ -79,7 +79,7 @@ def detect(params: Params, state: State, frames: Frames) -> tuple[State, lgmd.Re
 def detect_or_start(
     params: Params, state: State, frames: Frames, is_first: Bool[Array, ""]
 ) -> tuple[State, lgmd.Response]:
-    """Step both LGMDs as `detect` does, at a first frame from the states of `init_lgmd`."""
+    """Step both LGMDs as `detect` does; a first frame starts from the states of `init_lgmd`."""
     started = init_lgmd(params, frames)
     before = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), started, state.lgmd)
     return detect(params, replace(state, lgmd=before), frames)

@@ -1,4 +1,4 @@
-"""A layer of LSTM units: one frame of it, and many frames with a derivative written by hand.
+"""A layer of LSTM units: one frame, and many frames with a hand-written derivative.
 
     z = d + U h',  i, f, o = sigmoid(z_i, z_f, z_o),  g = tanh(z_g)
     c = f c' + i g
@@ -41,7 +41,7 @@ class Gates(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """What the derivative of `scan` needs; with a leading axis of frames where there is one."""
+    """What the derivative of `scan` needs; series have a leading axis of frames."""
 
     recurrence: Array
     initial: Memory
@@ -70,9 +70,9 @@ def scan(
     drive: Float[Array, "frames *batch gates"],
     is_first: Bool[Array, "frames *#batch"],
 ) -> Memory:
-    """Return the memories after every frame; before a frame that `is_first`, the memory is emptied.
+    """Return the memories after every frame; the memory is set to zero before each frame with `is_first`.
 
-    It has derivatives in reverse mode only.
+    Gradient: in reverse mode only.
     """
     return _scan(recurrence, memory, drive, is_first)[0]
 
@@ -88,7 +88,7 @@ def _scan(recurrence: Array, memory: Memory, drive: Array, is_first: Array) -> t
 
 
 def _differentiate(saved: _Saved, grads: Memory) -> tuple[Array, Memory, Array, None]:
-    """Return the gradients by the arguments of `scan` from those by its result."""
+    """Return the gradients with respect to the arguments of `scan` from those with respect to its result."""
     before = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs[:-1]]), saved.initial, saved.memories)
     before = _empty(before, saved.is_first)
 

@@ -10,8 +10,8 @@
 Source: Cizek & Faigl, sec. 3.4 (fig. 7); Hochreiter & Schmidhuber 1997, with the forget gate and the initial
 weights of Keras. `step` is one frame of the closed loop, `run` many frames of parallel walks with a fast derivative;
 the equations of their cell are in `lgmdjax.control.lstm`. Inputs are standardised and outputs rescaled by constants of
-the training data, which are not trained. The network then works around zero; the paper's must have learned the offsets
-and scales.
+the training data, which are not trained. The network then works around zero; the paper's network must have learned the
+offsets and scales.
 
 | variant           | what it is                                                                            |
 | ----------------- | ------------------------------------------------------------------------------------- |
@@ -54,7 +54,7 @@ FILE = storage.TensorFile(
 )
 RECURRENT = ("lstm", "lstm-efference")
 HEADER = schema.Object({"variant": schema.Text(VARIANTS), "units": schema.Integer(1, 4096), "symmetric": schema.Flag()})
-SCALE = schema.Numbers((2,), 1e-6, storage.MAX_WEIGHT)  # inputs are divided by one
+SCALE = schema.Numbers((2,), 1e-6, storage.MAX_WEIGHT)  # inputs are divided by it
 SCALES = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 
@@ -152,7 +152,7 @@ def run(
         states: before the first frame, with a leading axis of streams.
         u: of every frame.
         is_first: whether a stream starts again from the initial state with this frame.
-        executed: the velocity before each frame, the further input of `lstm-efference`; the network's own if None.
+        executed: the velocity executed before each frame, an input of `lstm-efference`; the network's own if None.
     """
     if params.variant == "lstm-efference" and executed is None:
         return _run_stepwise(params, states, u, is_first)
@@ -167,9 +167,9 @@ def run(
 
 
 def save(path: Path | str, params: Params, metadata: JsonObject | None = None) -> None:
-    """Write the navigator as one safetensors file, its variant, versions and `metadata` (JSON) in the header.
+    """Write the navigator as one safetensors file, with its variant, versions and `metadata` (JSON) in the header.
 
-    `metadata` tells which camera and detector the network was trained with, and in which rooms.
+    `metadata` says with which camera and detector the network was trained, and in which rooms.
     """
     structure = {"variant": params.variant, "units": params.units, "symmetric": params.symmetric}
     tensors = {name: np.asarray(value) for name, value in _tensors(params).items()}
@@ -190,7 +190,7 @@ def load(path: Path | str) -> tuple[Params, JsonObject]:
 
 
 def _run_stepwise(params: Params, states: State, u: Array, is_first: Array) -> tuple[State, Array]:
-    """Do as `run` where the input of a frame is the output of the one before."""
+    """Compute `run` frame by frame, for networks whose last output is an input."""
     initial = init(params)
 
     def frame(state: State, now: tuple[Array, Array]) -> tuple[State, Array]:

@@ -76,7 +76,7 @@ class DirectParams(Shown):
 
 @struct.dataclass(kw_only=True)
 class ReplayParams(Shown):
-    """Velocities that the teacher commanded, one a frame, in rooms other than the present one."""
+    """Velocities that the teacher commanded, one per frame, in rooms other than the present one."""
 
     velocities: Float[Array, "frames 2"]
 

@@ -1,14 +1,14 @@
-"""An alarm on a looming detector: its response on a scale that adapts to the scene, a threshold, and how long it lasts.
+"""Alarm of a looming detector: the response on a scale that adapts to the scene, a threshold, and a minimum duration.
 
-A detector's own u says how much moves. In a street it is near 1 all the time, in a laboratory near 0.5. What tells an
-approach in both is that the excitation rises over some tenths of a second above what it was during the last seconds.
+A detector's own u measures how much moves. In a street it is near 1 all the time, in a laboratory near 0.5. An approach
+shows in both as a rise of the excitation: over some tenths of a second it exceeds its mean over the last seconds.
 
 | symbol    | name                 | unit   | equation                                                       |
 | --------- | -------------------- | ------ | -------------------------------------------------------------- |
 | E_f       | view.excitation      | any    | of the detector                                                |
 | P_f       | -                    | grey   | change of the frame, averaged over blocks of its width / 16    |
 | M_f       | -                    | grey   | mean of |P_f|                                                  |
-| D_f       | -                    | grey   | median of P_f: what all of the field has in common             |
+| D_f       | -                    | grey   | median of P_f: the change that the whole field has in common   |
 | <x>_tau   | -                    | as x   | running mean of x with the time constant tau                   |
 | w_f       | response.whole_field | 0..1   | min(|<D>_fast| / <M>_fast, 1)                                  |
 | e_f       | -                    | any    | (1 - w_f) E_f                                                  |
@@ -17,19 +17,19 @@ approach in both is that the excitation rises over some tenths of a second above
 | -         | response.alarm       | 0, 1   | 1 where h_f >= persistence, and at least one frame             |
 | dt        | frame_time           | s      | -                                                              |
 
-A is 1/2 where the excitation is as it was, 2/3 where it has doubled, 3/4 where it is threefold: the logistic function
-of ln(<e>_fast / <e>_slow). It is 1/2 where nothing has moved yet. Four points:
+A is 1/2 where the excitation is constant, 2/3 where it has doubled, 3/4 where it has tripled: the logistic function of
+ln(<e>_fast / <e>_slow). It is 1/2 before anything has moved. Four points:
 
-- Running means begin with what they see first (they are divided by the weight that they have gathered), so scenery that
-  moves from the first frame on is no rise.
-- Frames in which nothing changes, as in a repeated frame or before a stimulus begins, are left out of all means: the
-  scale of motion is known only once something moves. So A stays as it is while a picture stands still, and an alarm
-  lasts until something moves again.
-- A change of light changes all of the field alike, so feed-forward inhibition w by the median takes it away; an object
-  moves the median only when it covers half of the field.
+- Running means start at their first value (they are divided by the sum of the weights so far), so scenery that moves
+  from the first frame on is not a rise.
+- Frames in which nothing changes, such as repeated frames or those before a stimulus, are left out of all means: they
+  tell nothing about the scale of motion. So A is constant while the picture stands still, and an alarm lasts until
+  something moves again.
+- A change of light changes the whole field alike. Feed-forward inhibition w, from the median, removes it. An object
+  shifts the median only if it covers half of the field.
 - Division by a running mean is the gain control of photoreceptors and of normalisation models (Heeger 1992). The median
-  as feed-forward inhibition is ours. Its form and the constants were chosen by the area under ROC on ten public clips,
-  those of `docs/detectors.md`: results on these clips are therefore optimistic.
+  as feed-forward inhibition is ours. Its form and the constants were chosen by the area under ROC on the ten public
+  clips of `docs/detectors.md`. Results on these clips are therefore optimistic.
 
 Gradient: exact almost everywhere; zero for threshold and persistence, which are steps.
 """
@@ -42,7 +42,7 @@ from lgmdjax.detectors.cells import Cells, Scalar, pool
 from lgmdjax.errors import InputError
 
 BLOCKS = 16  # in a row of the frame, whose changes are compared
-GAP = 0.5  # s, between two alarms below which people count them as one
+GAP = 0.5  # s; alarms with a shorter gap between them count as one
 STILL = 1e-3  # grey, mean change below which nothing has moved
 
 
@@ -59,7 +59,7 @@ class Params:
 
 @struct.dataclass(kw_only=True)
 class RunningMean:
-    """A sum of values and the weight that it has gathered."""
+    """A weighted sum of values, and the sum of their weights."""
 
     total: Scalar
     weight: Scalar
@@ -85,7 +85,7 @@ class State:
 
 @struct.dataclass(kw_only=True)
 class View:
-    """A frame and what the detector made of it."""
+    """A frame, and the excitation of the detector in it."""
 
     frame: Float[Array, "height width"]  # grey levels 0..255
     excitation: Scalar  # E, zero or more
@@ -101,7 +101,7 @@ class Response:
 
 
 def check(params: Params) -> None:
-    """Raise `InputError` for constants with which there is no alarm, or always one."""
+    """Raise `InputError` for constants with which there would never or always be an alarm."""
     if not 0.5 < float(params.threshold) < 1:
         raise InputError(
             f"alarm threshold: expected more than 0.5 (no rise) and less than 1, got {params.threshold}; "
@@ -164,5 +164,5 @@ def _update(mean: RunningMean, value: Array, gain: Array) -> RunningMean:
 
 
 def _ratio(part: Array, whole: Array, otherwise: float) -> Array:
-    """Return part / whole, and another number where the whole is zero."""
+    """Return part / whole, and `otherwise` where the whole is zero."""
     return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), jnp.full_like(whole, otherwise))

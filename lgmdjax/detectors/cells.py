@@ -1,4 +1,4 @@
-"""Operations that layers of cells share: pooling, neighbourhoods, thresholds, filters, grouping, checks of a frame.
+"""Operations on layers of cells: pooling, neighbourhoods, thresholds, filters, grouping, checks.
 
 | symbol    | name             | unit | meaning                                                      |
 | --------- | ---------------- | ---- | ------------------------------------------------------------ |
@@ -9,7 +9,7 @@
 | w, C_w, D | -, share, offset | grey | w = D + max |Ce| / C_w, the scale of Ce                      |
 
 The 3 x 3 kernels of the detectors depend on the distance alone, so a neighbourhood is two sums: over the four nearest
-cells and over the four diagonal ones. Such weights keep mirror symmetry whatever is learned.
+cells and over the four diagonal ones. Such weights stay mirror-symmetric whatever is learned.
 """
 
 import math
@@ -40,7 +40,7 @@ class Neighbours(NamedTuple):
 
 
 def neighbours(cells: Cells) -> Neighbours:
-    """Return the sums over the four nearest and the four diagonal neighbours; cells on the border count as their own.
+    """Return the sums over the four nearest and four diagonal neighbours; cells on the border replace missing ones.
 
     >>> neighbours(jnp.asarray([[1.0, 2.0], [3.0, 4.0]])).nearest.tolist()
     [[7.0, 9.0], [11.0, 13.0]]
@@ -129,9 +129,9 @@ def mean(cells: Cells, weights: Float[np.ndarray, " columns"] | None = None) -> 
 def pool(frame: Frame, pooling: int) -> Cells:
     """Average a frame over the square of each cell.
 
-    The number of cells is the one that comes nearest to `pooling` pixels a side. The cells divide the frame evenly,
-    pixels on a border belong to two cells in part, and mirrored frames give mirrored cells. Frames of bytes are summed
-    exactly, so that any compiler gives the same bits.
+    The side of a cell is as near to `pooling` pixels as a whole number of cells allows. The cells divide the frame
+    evenly: a pixel on their border counts partly for each. Mirrored frames give mirrored cells. Frames of bytes are
+    summed exactly, so that any compiler gives the same bits.
 
     >>> pool(jnp.arange(8.0).reshape(2, 4), 2).tolist()
     [[2.5, 4.5]]
@@ -142,13 +142,13 @@ def pool(frame: Frame, pooling: int) -> Cells:
     if frame.dtype == jnp.uint8:
         sums = _sum_cells(rows, as_float(frame), columns)
         # The zero hides a constant: XLA would multiply by its inverse, and in some programs fuse that product with the
-        # difference of two frames, which is then rounded otherwise.
+        # difference of two frames, which is then rounded differently.
         return sums / (row_total * column_total + 0 * sums[0, 0])
     return _sum_cells(rows / row_total, frame, columns / column_total)
 
 
 def pooling_parts(pixels: int, pooling: int) -> tuple[Int[np.ndarray, "cells pixels"], int]:
-    """Return how much of each pixel is in each cell, along one side of the frame, in parts of which a cell has `total`.
+    """Return how many parts of each pixel are in each cell, along one side of the frame, and how many parts a cell has.
 
     >>> pooling_parts(5, 2)  # the pixel in the middle is in both cells
     (array([[2, 2, 1, 0, 0],
@@ -163,9 +163,9 @@ def pooling_parts(pixels: int, pooling: int) -> tuple[Int[np.ndarray, "cells pix
 
 
 def _sum_cells(rows: np.ndarray, frame: Float[Array, "height width"], columns: np.ndarray) -> Array:
-    """Return the sums over cells, with the weight of every pixel's row and column."""
+    """Return the sums over cells, with pixels weighted by row and column."""
     cells, height = rows.shape
-    if height % cells == 0:  # a sum of whole rows, a quarter of the product's time
+    if height % cells == 0:  # a sum of whole rows takes a quarter of the product's time
         inner = jnp.sum(frame.reshape(cells, height // cells, -1), axis=1) * float(rows[0, 0])
     else:
         inner = jnp.matmul(jnp.asarray(rows, frame.dtype), frame, precision=lax.Precision.HIGHEST)

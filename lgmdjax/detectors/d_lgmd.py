@@ -1,9 +1,9 @@
-"""D-LGMD: excitation and inhibition spread over a neighbourhood, and inhibition arrives the later the farther it comes.
+"""D-LGMD: excitation and inhibition spread over a neighbourhood, and inhibition from farther cells arrives later.
 
-One detector serves one eye. A change excites the cells around it at once and inhibits a wider neighbourhood, that near
-by at once and the farther cells one or two frames later. An edge that moves faster than the inhibition spreads escapes
-it, so that the ratio of the two widths and the latency set the angular velocity to which the detector answers. Clusters
-of cells are raised, and a threshold that grows with the change of the whole image decays the rest.
+One detector serves one eye. A change excites the cells around it at once and inhibits a wider neighbourhood: near cells
+at once, farther cells one or two frames later. An edge that moves faster than the inhibition spreads escapes it. The
+ratio of the two widths and the latency therefore set the angular velocity to which the detector responds. Clusters of
+active cells are amplified, and a threshold that grows with the change of the whole image removes the rest.
 
 | symbol        | name                               | unit    | equation                                          |
 | ------------- | ---------------------------------- | ------- | ------------------------------------------------- |
@@ -29,16 +29,16 @@ of cells are raised, and a threshold that grows with the change of the whole ima
 
 Source: Zhao, Wang, Bellotto, Hu, Peng & Yue, "Enhancing LGMD's looming selectivity for UAV with spatial-temporal
 distributed presynaptic connections", IEEE Trans. Neural Networks and Learning Systems 34(5), 2023 (online 2021).
-Equations and constants are those of cquzjn/D-LGMD, the program of its first author; the paper itself could not be
-had. alpha, beta and lambda are those that stand beside others there as comments (-0.1, 0.5, 0.7); in force there are
--0.6, 0.4, 0.6. What surprises, and what is chosen here:
+Equations and constants are those of cquzjn/D-LGMD, the program of its first author; the paper itself was not
+available. alpha, beta and lambda (-0.1, 0.5, 0.7) are values in the program's comments; its code uses -0.6, 0.4, 0.6.
+Surprising points of the program, and choices made here:
 
 | point   | program                                                | here                                        |
 | ------- | ------------------------------------------------------ | ------------------------------------------- |
 | g       | in two dimensions, but normalised as in one, so that   | the same                                    |
 |         | inhibition sums to a s_I / s_E times excitation        |                                             |
 | latency | 0 where tau < 1, else 1; 2 where tau >= 1.9, which     | whole frames below tau; with `interpolated` |
-|         | tau comes near to but does not reach                   | shared between the two beside it, so that   |
+|         | tau comes near to but does not reach                   | shared between the two nearest, so that     |
 |         |                                                        | gradients reach alpha, beta and lambda      |
 | Ce      | 4 x 4 cells, half a cell off the middle                | the same, so not symmetric under mirroring  |
 | T_G     | grows with the sum of P, thus with the number of cells | with the mean; T_0 = 0.5 is chosen here,    |
@@ -56,8 +56,8 @@ of K / n_cell for an approach with l/|v| = 0.1 s, over that for the same square 
 | 80      | 5.7          | 91             |
 | 160     | 49           | 70             |
 
-Gradient: the step at T_G has none, so those of T_0 and T_max are zero, and without `interpolated` those of alpha, beta
-and lambda; the others are exact almost everywhere. With `smooth` the step is a sigmoid.
+Gradient: zero for T_0 and T_max, as T_G is a step, and without `interpolated` for alpha, beta and lambda; exact almost
+everywhere for the others. With `smooth` the step is a sigmoid.
 """
 
 from typing import NamedTuple
@@ -142,7 +142,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> state = init(Params(), jnp.zeros((6, 8)))
     >>> state, response = step(Params(), state, jnp.full((6, 8), 50.0))

@@ -1,15 +1,15 @@
-"""DSN: four networks that each ignore motion in one direction, fused so that all four must answer.
+"""DSN: four networks that each ignore motion in one direction, fused so that all four must respond.
 
 One detector serves one eye. Each cell is excited by the change of its pixel. In each of four networks it is inhibited
 by the earlier changes of the cells on one side of it, so an edge that comes from that side is cancelled by the
-inhibition that runs ahead of it. A growing object has edges in all directions, and every network is left with some of
-them; an object that passes is missed by one of the four.
+inhibition that runs ahead of it. A growing object has edges in all directions, so every network responds to some of
+them. An object that passes is missed by one of the four.
 
 | symbol      | name                       | unit    | equation                                                        |
 | ----------- | -------------------------- | ------- | --------------------------------------------------------------- |
 | L_f         | frame                      | grey    | -                                                               |
 | P_f         | layers.excitation          | grey    | |L_f - L_{f-1}|                                                 |
-| n_I, d      | reach, delay               | cells,  | how far inhibition spreads, and by how many frames it is late   |
+| n_I, d      | reach, delay               | cells,  | how far inhibition spreads, and its delay                       |
 |             |                            | frames  |                                                                 |
 | w_i         | decay                      | 1       | decay^(i - 1), over the sum of all n_I                          |
 | I_f^D(x)    | layers.inhibition          | grey    | sum over i = 1..n_I of w_i P_{f-d}(x - i e_D)                   |
@@ -25,16 +25,16 @@ Network D is the one that does not see motion in direction D. Beyond the border 
 
 Sources: Yue & Rind, "A synthetic vision system using directionally selective motion detectors to recognize collision",
 Artificial Life 13(2), 2007; "Postsynaptic organisations of directional selective visual neural networks for collision
-detection", Neurocomputing 103, 2013. Of the second the abstract was at hand, and of the first what later work says of
-it: inhibition that spreads in one direction, one or several frames late; a fusion that was evolved. Equations of the
+detection", Neurocomputing 103, 2013. Only the abstract of the second was available, and later descriptions of the
+first: inhibition spreads in one direction, one or several frames late, and the fusion was evolved. Equations of the
 networks and T_s = 12 are those of the public program of later work by the same group
 (fuqinbing/Binocular-DSN-Neural-Network-Model).
 
 | point      | papers, as far as known   | that program                     | here                                 |
 | ---------- | ------------------------- | -------------------------------- | ------------------------------------ |
 | excitation | change                    | |change| of foreground and frame | |change|, which is rectified         |
-| reach      | several cells             | 1 cell, weight 5.5 x 1.5         | 4 cells, W_I = 3, so that most of an |
-|            |                           |                                  | edge of up to 3 cells a frame goes   |
+| reach      | several cells             | 1 cell, weight 5.5 x 1.5         | 4 cells, W_I = 3, so most of an edge |
+|            |                           |                                  | of up to 3 cells a frame is removed  |
 | border     | -                         | the outermost cells inhibit none | they do                              |
 | cells      | pixels                    | pools P and I before S           | pools the frame: `pooling`           |
 | fusion     | weights and thresholds of | of all four and of disparity     | geometric mean: silent if one is     |
@@ -56,7 +56,7 @@ from lgmdjax.detectors.cells import U_AT_REST, Cells, Scalar, gate, mean, pool, 
 from lgmdjax.errors import InputError
 
 DIRECTIONS = ((0, -1), (0, 1), (-1, 0), (1, 0))  # steps in rows and columns: left, right, up, down
-SMALLEST = 1e-12  # grey, of K inside a logarithm
+SMALLEST = 1e-12  # grey, added to K inside a logarithm
 
 
 @struct.dataclass(kw_only=True)
@@ -94,7 +94,7 @@ class Response:
 
 
 class Layers(NamedTuple):
-    """Layers of cells for one frame, in grey levels; of four networks."""
+    """Layers of cells of the four networks for one frame, in grey levels."""
 
     excitation: Cells  # P
     inhibition: Float[Array, "4 rows columns"]  # I
@@ -116,7 +116,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> dark = jnp.zeros((6, 8))
     >>> _, response = step(Params(), init(Params(), dark), dark.at[2:4, 3:5].set(240.0))
@@ -154,7 +154,7 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
 
 
 def _spread(params: Params, change: Cells, direction: tuple[int, int]) -> Cells:
-    """Return the weighted sum of the changes behind each cell, against the direction; beyond the border none."""
+    """Return the weighted sum of the changes behind each cell, opposite to the direction; zero beyond the border."""
     rows, columns = change.shape
     n = params.reach
     padded = jnp.pad(change, n)

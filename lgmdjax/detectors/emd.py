@@ -18,13 +18,13 @@ away from the middle of the frame.
 
 x and y are the distance from the middle of the frame to the right and up. For a sine grating of amplitude A, wavelength
 W cells and frequency w [rad/s], the mean of R is A^2 h(w) sin(2 pi / W) w tau / (1 + (w tau)^2), with h(w) the power
-that the high-pass filter passes: it is largest near w = 1 / tau for every wavelength, and changes its sign with W < 2.
+that the high-pass filter passes: it is largest near w = 1 / tau for every wavelength, and changes its sign for W < 2.
 
 Source: Hassenstein & Reichardt 1956; Reichardt 1961; Borst & Egelhaaf 1989 for the form. tau = 50 ms and tau_H = 250 ms
 are those of zhaojunyu01/EMD-LPLC2-GF-model (Zhao et al. 2023), without its separation of ON and OFF. Outward motion as
-a template for looming is a textbook one; gain = 1000 is chosen here, so that u is well below 1 for most stimuli.
+a template for looming is textbook knowledge; gain = 1000 is chosen here, so that u is well below 1 for most stimuli.
 
-Gradient: exact; zero where motion is inward in the mean.
+Gradient: exact; zero where the mean motion is inward.
 """
 
 import jax
@@ -60,7 +60,7 @@ class State:
 
 @struct.dataclass(kw_only=True)
 class Motion:
-    """Motion between neighbouring cells: of one column less than cells to the right, of one row less upward."""
+    """Motion between neighbouring cells; `rightward` has one column fewer than the cells, `upward` one row fewer."""
 
     rightward: Float[Array, "rows columns-1"]  # R
     upward: Float[Array, "rows-1 columns"]  # U
@@ -86,7 +86,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> dark, edge = jnp.zeros((4, 6)), jnp.zeros((4, 6)).at[:, :2].set(200.0)
     >>> state, _ = step(Params(), init(Params(), dark), edge)
@@ -127,6 +127,6 @@ def correlate(state: State) -> Motion:
 
 
 def _side(motion: Array, axis: int) -> Float[Array, "count"]:
-    """Return -1 before the middle of an axis, 1 behind it, and 0 in it."""
+    """Return -1 before the middle of an axis, 1 after it, and 0 at it."""
     count = motion.shape[axis]
     return jnp.asarray(np.sign(np.arange(count) - (count - 1) / 2), motion.dtype)

@@ -1,6 +1,6 @@
 """The eta function: how a locust's LGMD fires, as a function of an object's true size and expansion.
 
-An ideal observer, which gets the geometry that other detectors have to see: an upper bound for them.
+An ideal observer: it is given the geometry that other detectors must see, so it is an upper bound for them.
 
 | symbol | name                | unit   | equation                                               |
 | ------ | ------------------- | ------ | ------------------------------------------------------ |
@@ -17,7 +17,7 @@ time after the object has reached theta_t, for all l/|v|.
 Source: Gabbiani, Krapp & Laurent, "Computation of object approach by a wide-field, motion-sensitive neuron", J.
 Neurosci. 19, 1999; Hatsopoulos, Gabbiani & Laurent 1995 for the function. theta_t = 24 degrees, thus alpha = 4.7, and
 delta = 27 ms are the means over neurons that are usually cited; the firing rate is C eta, and C differs from animal to
-animal. gain = 10 s is chosen here. Delays between two frames are interpolated, and `check` refuses those of more than
+animal. gain = 10 s is chosen here. Delays between two frames are interpolated, and `check` rejects those of more than
 HISTORY frames.
 
 Gradient: exact almost everywhere; zero for an object that recedes.

@@ -3,7 +3,7 @@
 One detector serves one eye that looks ahead. An animal that walks forward sees everything that stands still move from
 front to back. A part of the image that moves from back to front belongs to something that moves itself, or to the front
 edge of something that grows beside the animal; both may collide with it. What stands straight ahead and grows moves
-from front to back, and is not seen.
+from front to back and is not detected.
 
 | symbol | name                | unit   | equation                                          |
 | ------ | ------------------- | ------ | ------------------------------------------------- |
@@ -14,9 +14,9 @@ from front to back, and is not seen.
 | u      | response.u          | 0.5..1 | 1 / (1 + exp(-gain E))                            |
 
 Source: Chalupka, Dickinson & Perona, "Generalized regressive motion: a visual cue to collision", Bioinspiration &
-Biomimetics 11, 2016, after Zabala et al. 2012, for the cue; of both, the abstracts were at hand. That the motion comes
-from correlators, is rectified cell by cell and averaged over a hemifield is chosen here, and so is gain = 1000, as in
-emd. The middle column of detectors belongs to neither half.
+Biomimetics 11, 2016, after Zabala et al. 2012, for the cue; only the abstracts were available. Chosen here: the motion
+comes from correlators, is rectified cell by cell and averaged over a hemifield; gain = 1000, as in emd. The middle
+column of detectors belongs to neither half.
 
 Gradient: exact almost everywhere.
 """
@@ -58,7 +58,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> dark, edge = jnp.zeros((4, 9)), jnp.zeros((4, 9)).at[:, :2].set(200.0)
     >>> state, _ = step(Params(), init(Params(), dark), edge)

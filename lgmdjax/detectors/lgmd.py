@@ -1,9 +1,8 @@
 """Lobula giant movement detector (LGMD): a model of the locust's neuron that responds to objects on a collision course.
 
 One detector serves one eye. Each cell is excited by the change of its pixels since the last frame and inhibited, one
-frame later, by the changes around it. Edges that spread faster than the inhibition pass, which are those of an
-approaching object. Whole-field motion, such as a fast turn, is recognised by its total change and suppresses the
-response.
+frame later, by the changes around it. Edges that move faster than the inhibition spreads pass: those of an approaching
+object. Whole-field motion, such as a fast turn, is recognised by its total change and suppresses the response.
 
 | symbol | name                  | unit        | equation |
 | ------ | --------------------- | ----------- | -------- |
@@ -25,10 +24,10 @@ Source: Cizek & Faigl, sec. 3.3; Blanchard, Rind & Verschure 2000. Two equations
 corrected: eq. 15 averages the signed change, which is zero for a moving edge (`printed_feed_forward`), and eq. 16 keeps
 u when FF is high, where the text says that high FF suppresses it (`printed_gate`). Cells outside the image are zero.
 
-The paper has one cell per pixel; with `pooling` n a cell averages about n x n pixels. A texture that is resolved moves
-across the image at v/d, but it is finer by the same factor, so that the change it causes is the same at any distance.
+The paper has one cell per pixel; with `pooling` n a cell averages about n x n pixels. A resolved texture at distance d
+moves across the image at v/d, but it is finer by the same factor, so it causes the same change at any distance.
 Cells of several degrees average out distant, fine texture, as the locust's facets do, and keep what is near. The
-difference between the u of the two eyes correlates with that of nearness as follows (320 x 240 pixels):
+difference between the u of the two eyes correlates with the difference in nearness as follows (320 x 240 pixels):
 
 | pooling | r    |
 | ------- | ---- |
@@ -43,8 +42,8 @@ divided by the mean of all w. An obstacle that a robot passes at a distance y fr
 v sin(theta)^2 / y, fastest when it is beside the robot and no longer matters; p = 2 compensates for that. The first
 column of a frame is then the outermost one, for the right eye too (`hemifield.outermost_first`).
 
-The kernel sums to 2.92, times W_I to 1.168: where a change repeats itself, summation is negative, and only new edges
-pass. The frame after `init` has no last change yet, hence no inhibition.
+The sum of the kernel is 2.92, and times W_I it is 1.168. So where a change repeats itself, the summation is negative,
+and only new edges pass. The frame after `init` has no last change yet, hence no inhibition.
 
 Gradient: thresholds are steps, so the gradients of T_s and T_f are zero and the others are exact almost everywhere.
 With `smooth` both steps are sigmoids of a width in grey levels, which tend to the steps as the width tends to zero.
@@ -66,7 +65,7 @@ from lgmdjax.html import Shown
 
 KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
 U_AT_REST = cells.U_AT_REST
-SCALARS = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I: what is calibrated
+SCALARS = ("threshold", "suppression", "inhibition")  # T_s, T_f, W_I: the constants that are calibrated
 FULL_WEIGHT_BEARING = math.radians(20.0)  # theta_0, up to which all cells have the same weight
 
 # w_I (eq. 9)
@@ -137,7 +136,7 @@ def init(params: Params, frame: cells.Frame) -> State:
 def step(params: Params, state: State, frame: cells.Frame) -> tuple[State, Response]:
     """Process the next frame (eqs. 7-16).
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is of neither floats nor bytes.
 
     Gradient: see the module; |.| of eqs. 8, 10 and 13 has derivative 0 at 0.
 
@@ -187,7 +186,7 @@ def inhibit(kernel: Float[Array, "5 5"], difference: Float[Array, "height width"
 
     The kernel is replaced by the mean of its four mirror images. The detectors of the left and right eye then remain
     mirror images of each other whatever is learned. Rows can also be added in pairs before they are weighted: 13
-    products a cell instead of 25, which XLA compiles to one vectorised loop (`lax.conv` takes 30 times as long on a
+    products per cell instead of 25, which XLA compiles to one vectorised loop (`lax.conv` takes 30 times as long on a
     CPU).
     """
     height, width = difference.shape
@@ -241,14 +240,14 @@ def check(params: Params) -> None:
     if w.shape != (2 * KERNEL_RADIUS + 1, 2 * KERNEL_RADIUS + 1):
         raise InputError(f"lgmd kernel: expected shape (5, 5), got {w.shape}; eq. 9 is lgmd.KERNEL")
     if not (np.allclose(w, w[::-1]) and np.allclose(w, w[:, ::-1])):
-        raise InputError("lgmd kernel: expected a symmetric kernel, got other weights on one side; average them")
+        raise InputError("lgmd kernel: expected a symmetric kernel, got different weights on two sides; average them")
 
 
 def _mean_excitation(params: Params, summation: Float[Array, "height width"]) -> Float[Array, ""]:
     """Return the mean over the cells of what exceeds T_s (eqs. 12, 13, and the division of eq. 14) [grey]."""
     S, margin = summation, summation - params.threshold
     sigmoid = params.smooth
-    # A pixel that is not a number has to show: `margin >= 0` would count it as no excitation.
+    # A pixel that is not a number must show in u: `margin >= 0` would count it as no excitation.
     passed = S * jax.nn.sigmoid(margin / params.threshold_width) if sigmoid else jnp.where(margin < 0, 0.0, S)
     return _mean(params, jnp.abs(passed))
 

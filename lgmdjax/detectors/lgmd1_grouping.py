@@ -1,4 +1,4 @@
-"""LGMD1 with a grouping layer: clusters of excited cells, which expanding edges make, pass; scattered ones do not.
+"""LGMD1 with a grouping layer: clusters of excited cells, as at expanding edges, pass; isolated cells do not.
 
 One detector serves one eye. As in `lgmdjax.detectors.lgmd`, each cell is excited by the change of its pixel and
 inhibited by the last change around it. What is left is multiplied by its mean over 3 x 3 cells, so that edges are
@@ -27,9 +27,9 @@ whole image.
 Source: Yue & Rind, "Collision detection in complex dynamic scenes using an LGMD-based visual neural network with
 feature enhancement", IEEE Trans. Neural Networks 17(3), 2006. Constants are those of public programs: W_I, w_n, w_d and
 T_FFI of fuqinbing/LGMD-Plus-and-GAs-Open-Source; D_c, C_w, C_de and T_de of fuqinbing/LGMD2-open-source; Gary2017/LGMD
-has the same ones. There, a spike is u >= 0.78 and a collision five spikes in a row, which is left to whoever reads u.
+has the same ones. There, a spike is u >= 0.78 and a collision five spikes in a row; here that is left to the caller.
 
-Errata, and where the sources differ. The paper was not at hand: its column is as later work describes it.
+Errata, and differences between the sources. The paper was not available; its column follows later work.
 
 | point               | paper                       | public programs                      | here                     |
 | ------------------- | --------------------------- | ------------------------------------ | ------------------------ |
@@ -43,8 +43,8 @@ Errata, and where the sources differ. The paper was not at hand: its column is a
 |                     | frame of noise alone passes |                                      |                          |
 | cells on the border | -                           | the last row or column is repeated   | the same                 |
 
-Gradient: the thresholds are steps, so the gradients of T_de and T_FFI are zero, that of C_de too, and the others are
-exact almost everywhere. With `smooth` both steps are sigmoids.
+Gradient: the thresholds are steps, so the gradients of T_de, C_de and T_FFI are zero and the others are exact almost
+everywhere. With `smooth` both steps are sigmoids.
 """
 
 import jax
@@ -123,7 +123,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> params = Params()
     >>> state = init(params, jnp.zeros((6, 8)))

@@ -1,6 +1,6 @@
-"""LGMD1 with ON and OFF channels and spike-frequency adaptation: approach is told from recession and translation.
+"""LGMD1 with ON and OFF channels and spike-frequency adaptation: selective for approach, not recession or translation.
 
-One detector serves one eye. Brightening and darkening run in channels of their own. In the ON channel a cell excites at
+One detector serves one eye. Brightening and darkening run in separate channels. In the ON channel a cell excites at
 once and its neighbours inhibit it later; in the OFF channel it inhibits at once and its neighbours excite it later. The
 response to motion that does not accelerate adapts.
 
@@ -24,8 +24,8 @@ response to motion that does not accelerate adapts.
 Source: Fu, Hu, Peng & Yue, "Shaping the collision selectivity in a looming sensitive neuron model with parallel ON and
 OFF pathways and spike frequency adaptation", Neural Networks 106, 2018. Equations and constants are those of LGMDs.cs
 of fuqinbing/LGMD2-open-source, which its first author calls the general model; they were not compared with the paper.
-There, exp(4 (u - 0.78)), rounded down, are spikes, and eight spikes without a pause a collision, which is left to
-whoever reads u. Other constants that are in use:
+There, exp(4 (u - 0.78)), rounded down, are spikes, and eight spikes without a pause a collision; here that is left
+to the caller. Other constants in use:
 
 | constant    | LGMDs.cs (here) | Fu2018.cs of Gary2017/LGMD             |
 | ----------- | --------------- | -------------------------------------- |
@@ -90,7 +90,7 @@ class Params:
 
 @struct.dataclass(kw_only=True)
 class State:
-    """What the next frame needs of this one."""
+    """What the next frame needs from this one."""
 
     frame: Cells  # L
     channels: Channels  # ON, OFF
@@ -132,7 +132,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> params = Params(suppression=100.0)
     >>> state = init(params, jnp.zeros((6, 8)))
@@ -172,7 +172,7 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
 
 
 def _neighbourhood(params: Params, before: Cells, now: Cells) -> Cells:
-    """Return N: the weighted sum over the neighbours, the farther the later."""
+    """Return N: the weighted sum over the neighbours, delayed longer for the farther ones."""
     dt = params.frame_time
     nearest = neighbours(on_off.delayed(before, now, dt, params.delay_nearest)).nearest
     diagonal = neighbours(on_off.delayed(before, now, dt, params.delay_diagonal)).diagonal

@@ -1,8 +1,8 @@
-"""LGMD2: a looming detector for objects that are darker than their surroundings, as the young locust's.
+"""LGMD2: a looming detector of young locusts, for objects that are darker than their surroundings.
 
-One detector serves one eye. Brightening and darkening run in channels of their own, and inhibition is so strong in the
+One detector serves one eye. Brightening and darkening run in separate channels, and inhibition is so strong in the
 ON channel that little passes. Inhibition grows with the change of the whole image (photoreceptor mediation) instead of
-suppressing the response. Clusters of cells are raised and the response adapts.
+suppressing the response. Clusters of active cells are amplified, and the response adapts.
 
 | symbol          | name                            | unit    | equation                                             |
 | --------------- | ------------------------------- | ------- | ---------------------------------------------------- |
@@ -25,10 +25,10 @@ suppressing the response. Clusters of cells are raised and the response adapts.
 Source: Fu, Hu, Peng, Rind & Yue, "A robust collision perception visual neural network with specific selectivity to
 darker objects", IEEE Trans. Cybernetics 50(12), 2020. Equations and constants are those of lgmd2OpenSource.cs of
 fuqinbing/LGMD2-open-source, which its first author published for this paper. There, exp(4 (u - 0.78)), rounded down,
-are spikes, and eight spikes without a pause a collision, which is left to whoever reads u.
+are spikes, and eight spikes without a pause a collision; here that is left to the caller.
 
 A cell of the ON channel inhibits itself by at least b_on w_on a ON = 1.38 ON at 30 frames/s, so with these constants
-nothing passes the ON channel below 67 frames/s, and the detector answers to darkening alone.
+nothing passes the ON channel below 67 frames/s, and the detector responds to darkening only.
 
 Gradient: the thresholds are steps, so the gradients of T_de, C_de and T_sfa are zero and the others are exact almost
 everywhere. With `smooth` the step at T_de is a sigmoid.
@@ -96,7 +96,7 @@ class Params:
 
 @struct.dataclass(kw_only=True)
 class State:
-    """What the next frame needs of this one."""
+    """What the next frame needs from this one."""
 
     frame: Cells  # L
     channels: Channels  # ON, OFF
@@ -138,7 +138,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> params, bright, dark = Params(), jnp.full((6, 8), 90.0), jnp.full((6, 8), 70.0)
     >>> [round(float(step(params, init(params, a), b)[1].u), 2) for a, b in ((bright, dark), (dark, bright))]
@@ -162,7 +162,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
 
 
 def layers(params: Params, state: State, pooled: Cells, mediation: Float[Array, ""]) -> Layers:
-    """Return the layers of cells for the next frame, which is pooled, and its photoreceptor mediation."""
+    """Return the layers of cells for the next frame, given as pooled cells, and its photoreceptor mediation."""
     now, before = on_off.split(state.channels, pooled - state.frame, params.residual), state.channels
     share, dt = mediation / params.mediation_scale, params.frame_time
     I_on = _inhibition(before.on, now.on, params.on_kernel, params.on_delays, dt)
@@ -176,6 +176,6 @@ def layers(params: Params, state: State, pooled: Cells, mediation: Float[Array, 
 
 
 def _inhibition(before: Cells, now: Cells, kernel: Triple, delays: Triple, frame_time: float) -> Cells:
-    """Return the weighted sum over a cell and its neighbours, the farther the later."""
+    """Return the weighted sum over a cell and its neighbours, delayed longer for the farther ones."""
     own, nearest, diagonal = (on_off.delayed(before, now, frame_time, delays[i]) for i in range(3))
     return kernel[0] * own + kernel[1] * neighbours(nearest).nearest + kernel[2] * neighbours(diagonal).diagonal

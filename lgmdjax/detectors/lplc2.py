@@ -1,8 +1,8 @@
-"""LPLC2: a population of neurons of the fruit fly, each of which answers to motion outward from its own centre.
+"""LPLC2: a population of neurons of the fruit fly, each of which responds to motion outward from its own centre.
 
-One detector serves one eye. The dendrites of an LPLC2 neuron reach into the four layers of the lobula plate, each of
-which sees motion in one direction, and in each they spread in that direction from the neuron's centre: outward motion
-excites. Inward motion inhibits through interneurons. The units are spread over the frame.
+One detector serves one eye. The dendrites of an LPLC2 neuron reach into the four layers of the lobula plate. Each layer
+sees motion in one direction, and the dendrites in it spread in that direction from the neuron's centre, so outward
+motion excites. Inward motion inhibits through interneurons. The units are spread over the frame.
 
 | symbol | name                 | unit   | equation                                                              |
 | ------ | -------------------- | ------ | --------------------------------------------------------------------- |
@@ -19,9 +19,9 @@ excites. Inward motion inhibits through interneurons. The units are spread over 
 Source: Klapoetke et al., "Ultra-selective looming detection from radial motion opponency", Nature 551, 2017, for the
 anatomy; Zhou, Li, Kim, Lafferty & Clark, "Shallow neural networks trained to detect collisions recover features of
 visual loom-selective neurons", eLife 11, 2022, for the equations: their model with rectified inhibition and with
-symmetry under rotation, of K = 12 cells of 5 degrees, which learns its weights. Theirs are not used. Those here are
-chosen after the anatomy: 1 / (number of cells of a sector) in the sector of +-45 degrees to the right of the centre for
-w_e, and the mirror image for w_i, in a disc of K cells. Other choices and differences:
+symmetry under rotation, of K = 12 cells of 5 degrees. Their learned weights are not used. The weights here follow the
+anatomy: 1 / (number of cells of a sector) in the sector of +-45 degrees to the right of the centre for w_e, and the
+mirror image for w_i, in a disc of K cells. Other choices and differences:
 
 | point    | Zhou et al.                    | here                                               |
 | -------- | ------------------------------ | -------------------------------------------------- |
@@ -31,7 +31,7 @@ w_e, and the mirror image for w_i, in a disc of K cells. Other choices and diffe
 | b_e, b_i | learned                        | -1, so that grating and turn do not pass (test); 0 |
 | u        | learned gain and offset        | gain = 10, offset 0: u is 0.5 without motion       |
 
-Cells should be about 5 degrees wide, as the fly's: `emd.Params(pooling=...)`.
+Cells should be about 5 degrees wide, like those of the fly: `emd.Params(pooling=...)`.
 
 Gradient: exact almost everywhere; 0 where every unit is silent.
 """
@@ -92,7 +92,7 @@ class Response:
 
 
 def create(size: int) -> Params:
-    """Return parameters of units of `size` x `size` cells; raise `InputError` for an even number."""
+    """Return parameters for units of `size` x `size` cells; raise `InputError` for an even number."""
     weights = (jnp.asarray(sector(size, inward), dtype=float) for inward in (False, True))
     excitation, inhibition = weights
     return Params(excitation_weights=excitation, inhibition_weights=inhibition)
@@ -106,7 +106,7 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
 def step(params: Params, state: State, frame: Float[Array, "height width"]) -> tuple[State, Response]:
     """Process the next frame.
 
-    Raises `InputError` during tracing if the frame has another size than the last one or is not of floats.
+    Raises `InputError` during tracing if the frame differs in size from the last one or is not of floats.
 
     >>> state, response = step(Params(), init(Params(), jnp.zeros((12, 16))), jnp.ones((12, 16)))
     >>> response.units.shape, float(response.u)

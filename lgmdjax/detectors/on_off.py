@@ -11,12 +11,12 @@
 | h           | -                 | 1      | tau_hp / (dt + tau_hp)                                                |
 | u_f         | adapted           | 0.5..1 | h k_f if k_f rose by more than T_sfa, else h (u_{f-1} + rise); >= 0.5 |
 
-Source: the equations of fuqinbing/LGMD2-open-source, the programs of the first author. Where they surprise:
+Source: the equations of fuqinbing/LGMD2-open-source, the programs of the first author. Surprising points:
 
 | point      | there                                                                | here                             |
 | ---------- | -------------------------------------------------------------------- | -------------------------------- |
 | delay      | called a low-pass filter of the first order, but it mixes this input | the same                         |
-|            | with the last one and remembers no output                            |                                  |
+|            | with the last one and stores no output                               |                                  |
 | rectifiers | clip at 0.1 for integers, so that 0 < P < 0.1 would be OFF           | clip at 0, the same for integers |
 
 Gradient: exact almost everywhere; zero for T_sfa, and where the adapted potential rests at 0.5.
@@ -66,7 +66,7 @@ def split(before: Channels, change: Cells, residual: Scalar) -> Channels:
 
 
 def delayed(before: Cells, now: Cells, frame_time: float, time_constant: Scalar) -> Cells:
-    """Mix the last activity into the present one, the more the longer the time constant."""
+    """Return the present activity mixed with the last one, whose weight grows with the time constant."""
     a = frame_time / (frame_time + time_constant)
     return a * now + (1.0 - a) * before
 

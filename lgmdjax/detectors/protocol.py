@@ -1,14 +1,14 @@
-"""What a looming detector is: four names of a module, or of any object.
+"""The interface of a looming detector: four names of a module, or of any object.
 
 | name     | meaning                                                                                                  |
 | -------- | -------------------------------------------------------------------------------------------------------- |
 | Params   | a pytree; `Params()` has the published constants                                                         |
 | init     | init(params, frame) -> state                                                                             |
 | step     | step(params, state, frame) -> (state, response), for one eye; scan and vmap are the caller's             |
-| Response | has `u`, 0.5 without motion and up to 1, and `excitation`, which is not squashed; anything else is extra |
+| Response | has `u`, 0.5 without motion and up to 1, and `excitation`, which is not squashed; other fields are free  |
 
-Every detector of this package is one, and so is the template of the page "Write your own detector". The ideal observers
-are of the same form, but get the object's true size in the place of a frame.
+Every detector of this package has this interface, and so has the template of the page "Write your own detector". The
+ideal observers have it too, but get the object's true size instead of a frame.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ class Detector(Protocol):
 
 @struct.dataclass(kw_only=True)
 class Geometry:
-    """True size and expansion of the object that an eye sees; zero where there is none."""
+    """True size and expansion of the object that an eye sees; zero without an object."""
 
     size: Scalar  # theta, the full angle [rad]
     rate: Scalar  # its derivative [rad/s]

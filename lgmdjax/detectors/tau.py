@@ -1,6 +1,6 @@
 """Tau: the time to contact, from an object's true size and expansion.
 
-An ideal observer, which gets the geometry that other detectors have to see: an upper bound for them.
+An ideal observer: it is given the geometry that other detectors must see, so it is an upper bound for them.
 
 | symbol | name                | unit   | equation                                                     |
 | ------ | ------------------- | ------ | ------------------------------------------------------------ |

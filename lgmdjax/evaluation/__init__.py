@@ -1,4 +1,4 @@
-"""The paper's trials and the metrics of their outcome."""
+"""The paper's trials and their metrics; looming detectors on stimuli and on video clips."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""Labels of video clips: what each shows, and when it comes to contact.
+"""Labels of video clips: what each shows, and when contact occurs.
 
-`labels.csv` has the columns `clip` (a file beside it), `kind`, `contact_s` (empty where there is none) and any others:
+`labels.csv` has the columns `clip` (a file beside it), `kind`, `contact_s` (empty without contact) and any others:
 
 ```text
 clip,kind,contact_s,what
@@ -8,7 +8,7 @@ c01.mp4,collision,2.1,night; another car crosses and is hit
 nc03.mp4,none,,an oncoming car passes
 ```
 
-Kinds `collision` and `approach` ask for an alarm, with or without a time of contact. All others do not.
+Kinds `collision` and `approach` call for an alarm, with or without a time of contact. All others do not.
 """
 
 import csv
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from lgmdjax.errors import InputError
 
-APPROACHING = ("collision", "approach")  # kinds that ask for an alarm
+APPROACHING = ("collision", "approach")  # kinds that call for an alarm
 OTHERS = ("none", "recede", "translate")  # common kinds that do not
 COLUMNS = ("clip", "kind", "contact_s")
 
@@ -30,7 +30,7 @@ class Label:
     clip: str  # name of the file
     kind: str
     contact: float | None = None  # s
-    what: str = ""  # for people
+    what: str = ""  # description
 
     @property
     def is_approach(self) -> bool:

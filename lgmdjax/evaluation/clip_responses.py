@@ -1,7 +1,7 @@
 """Responses of looming detectors to video clips, seen by one eye that receives the whole picture.
 
-Pictures are area-averaged to 64 x 48 cells whatever their sides are, so that a detector is compiled once for all clips.
-Detectors keep their published constants, which are for 30 frames a second; the alarm knows each clip's rate.
+Pictures of any size are area-averaged to 64 x 48 cells, so that a detector is compiled once for all clips.
+Detectors keep their published constants, which are for 30 frames a second; the alarm uses each clip's rate.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,14 +24,14 @@ from lgmdjax.sensors import camera
 
 WIDTH, HEIGHT = 64, 48  # cells
 CHUNK = 32  # frames that are processed at once
-MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third is the first with all of it
-MAX_OVERTIME = 0.5  # s, of a labelled contact after the end of a clip, which a label may miss by that much
+MIN_FRAMES = 3  # inhibition is delayed by a frame, so the third frame is the first with full inhibition
+MAX_OVERTIME = 0.5  # s; a labelled contact may be this long after the end of its clip, as labels are inexact
 THUMBNAIL_WIDTH = 160  # px
 
 
 @dataclass(frozen=True, kw_only=True)
 class Clip:
-    """A clip as the detectors see it, and some of its pictures for people."""
+    """A clip as the detectors see it, and thumbnails of some of its frames."""
 
     label: Label
     rate: float  # frames a second
@@ -42,7 +42,7 @@ class Clip:
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """Responses of one detector to one clip; of the first frame, in which nothing has changed, as at rest."""
+    """Responses of one detector to one clip; to the first frame, in which nothing has changed, those at rest."""
 
     u: Float[np.ndarray, " frames"]  # the detector's own
     excitation: Float[np.ndarray, " frames"]
@@ -51,9 +51,9 @@ class Trace:
 
 
 def read_clip(folder: Path, label: Label, pictures: int = 10) -> Clip:
-    """Read a clip twice: in cells, and some pictures of it.
+    """Return a clip in cells, with some thumbnails.
 
-    Raises `InputError` if it is missing or no video, or shorter than its label says.
+    Raises `InputError` if it is missing, not a video, or shorter than its label says.
     """
     path = folder / label.clip
     with video_io.open_reader(path) as video:

@@ -4,7 +4,7 @@ An alarm is a response that stays above a threshold for some time; gaps of up to
 
 | word        | meaning                                                                                              |
 | ----------- | ---------------------------------------------------------------------------------------------------- |
-| window      | from 1.5 s before contact to 0.1 s after it, which is how exact labels are                           |
+| window      | from 1.5 s before contact to 0.1 s after it; labels are exact to 0.1 s                               |
 | hit         | there is an alarm in the window; without a time of contact, anywhere in a clip that approaches       |
 | lead        | time from the first alarm in the window to contact [s], at most 1.5                                  |
 | false alarm | an alarm begins before the window, or anywhere in a clip that does not approach                      |
@@ -12,9 +12,9 @@ An alarm is a response that stays above a threshold for some time; gaps of up to
 | stretch     | about 1.5 s of those minutes                                                                         |
 | AUC         | area under ROC: largest responses in the windows against those in the stretches                      |
 
-Threshold and persistence are chosen where the share of hits exceeds the share of stretches with a false alarm by most:
-in the middle of the widest range of thresholds that does so best, and for the shortest persistence. They are never
-chosen on the clips that are scored: by leave-one-out, or on either half of the clips for the other one.
+Threshold and persistence maximise the share of hits minus the share of stretches with a false alarm. Of equally good
+choices, the middle of the widest range of thresholds is taken, with the shortest persistence. They are never chosen on
+the clips that are scored, but by leave-one-out, or on one half of the clips for the other half.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -35,8 +35,8 @@ WINDOW = 1.5  # s before contact
 LATE = 0.1  # s after contact
 PEAK_TOLERANCE = 0.4  # s, between the largest response of a clip and contact
 PERSISTENCES = (0.0, 0.1, 0.2, 0.3)  # s
-THRESHOLDS = 100  # that are tried of either kind
-LEVEL = 1e-9  # two scores this close are equal
+THRESHOLDS = 100  # number of quantiles that are tried, and of evenly spaced values
+LEVEL = 1e-9  # two scores this close count as equal
 
 
 class Series(NamedTuple):
@@ -56,7 +56,7 @@ class Setting(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """What an alarm did in one clip, for each persistence and threshold."""
+    """Hits and false alarms in one clip, for each persistence and threshold."""
 
     hits: Bool[np.ndarray, "persistences thresholds"]
     leads: Float[np.ndarray, "persistences thresholds"]  # s; nan without a hit or a time of contact
@@ -111,7 +111,7 @@ def score(series: Sequence[Series]) -> JsonObject:
 
 
 def _candidates(responses: Float[np.ndarray, " n"]) -> Float[np.ndarray, " thresholds"]:
-    """Return thresholds to try: quantiles, as responses may be crowded near 1, and evenly spaced ones."""
+    """Return thresholds to try: quantiles, since responses may be crowded near 1, and evenly spaced ones."""
     even = np.linspace(responses.min(), responses.max(), THRESHOLDS)
     return np.unique(np.concatenate([np.quantile(responses, np.linspace(0, 1, THRESHOLDS)), even]))
 
@@ -129,14 +129,14 @@ def begin(series: Series, setting: Setting) -> list[float]:
 
 
 def window(label: Label) -> tuple[float, float]:
-    """Return when a hit may begin [s]: all of a clip that approaches without contact, nothing of one that does not."""
+    """Return the interval [s] in which an alarm is a hit: all of an approach without contact, none of other clips."""
     if not label.is_approach:
         return np.inf, np.inf
     return (-np.inf, np.inf) if label.contact is None else (label.contact - WINDOW, label.contact + LATE)
 
 
 def count(series: Series, thresholds: Float[np.ndarray, " thresholds"], persistences: Sequence[float]) -> Counts:
-    """Count what alarms with every persistence and threshold do in a clip."""
+    """Count hits and false alarms in a clip, for every persistence and threshold."""
     low, high = window(series.label)
     in_window = (series.time >= low) & (series.time <= high)
     before = series.time < low
@@ -158,12 +158,12 @@ def count(series: Series, thresholds: Float[np.ndarray, " thresholds"], persiste
 
 
 def _first_time(time: np.ndarray, is_on: np.ndarray) -> np.ndarray:
-    """Return the time of the first frame with an alarm for each threshold; nan without."""
+    """Return the time of the first frame with an alarm for each threshold; nan without one."""
     return np.where(is_on.any(axis=0), time[is_on.argmax(axis=0)], np.nan)
 
 
 def _alarmed(series: Series, thresholds: np.ndarray, persistence: float) -> Bool[np.ndarray, "frames thresholds"]:
-    """Return the frames with an alarm: from the last of the frames on that it needs."""
+    """Return the frames with an alarm, which begins when the response has lasted as many frames as it must."""
     frames = alarm.required_frames(persistence, 1 / series.rate)
     padded = np.concatenate([np.full(frames - 1, -np.inf), series.response])
     lasting = np.lib.stride_tricks.sliding_window_view(padded, frames).min(axis=1)
@@ -214,7 +214,7 @@ def split_halves(labels: Sequence[Label]) -> tuple[list[int], list[int]]:
 
 
 def summarise(counts: Sequence[Counts], settings: Iterable[tuple[int, int]]) -> Outcome:
-    """Return the scores of clips, each with a setting of its own."""
+    """Return the scores of clips, each with its own setting."""
     chosen = list(zip(counts, settings, strict=True))
     approaches = sum(each.is_approach for each in counts)
     hits = sum(bool(each.hits[k]) for each, k in chosen if each.is_approach)
@@ -251,7 +251,7 @@ def _windows(series: Series) -> list[np.ndarray]:
 
 
 def peak_is_at_contact(series: Series) -> bool:
-    """Return whether the largest response of the whole clip is close to contact, which no alarm could know."""
+    """Return whether the largest response of the whole clip is close to contact; no alarm can know that in time."""
     contact = series.label.contact
     return contact is not None and bool(abs(series.time[np.argmax(series.response)] - contact) <= PEAK_TOLERANCE)
 

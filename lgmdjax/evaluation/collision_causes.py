@@ -77,7 +77,7 @@ _CYCLE = round(AVERAGING_TIME * FRAME_RATE)  # frames
 
 @dataclass(frozen=True, kw_only=True)
 class QuietBaseline:
-    """Levels of u with nothing near, against which u before a contact is compared."""
+    """Levels of u with nothing near, with which u before a contact is compared."""
 
     u_levels: tuple[float, ...]  # quantile `QUIET_QUANTILE` of u with nothing near, in each band of turning
     difference_std: float  # standard deviation of u_l - u_r
@@ -89,9 +89,9 @@ class Collision:
 
     robot: int
     frame: int
-    limb: str  # that touched, a name of `hexapod.CAPSULES`
+    limb: str  # touching limb, a name of `hexapod.CAPSULES`
     point: tuple[float, float]  # m, on the robot, seen from above: ahead of the trunk's centre, to its left
-    obstacle: str  # that was touched: box, wall or cylinder
+    obstacle: str  # touched obstacle: box, wall or cylinder
     in_corner: bool  # another obstacle was near on the other side at the same time
     u_rise: float  # maximum of u minus its baseline
     u_difference: float  # maximum of |u_l - u_r|, in units of difference_std
@@ -135,7 +135,7 @@ class _Place(NamedTuple):
 
 
 def classify(record: Record, arenas: arena.Arena, baseline: QuietBaseline | None = None) -> list[Collision]:
-    """Describe every collision of recorded walks, in the order of robots and frames; each knows its `cause`.
+    """Describe every collision of recorded walks, in the order of robots and frames; each has its `cause`.
 
     Args:
         record: walks, axes (robot, frame).

@@ -141,7 +141,7 @@ def _euler_angles(quaternion: Float[ndarray, "steps 4"]) -> tuple[ndarray, ndarr
 
 
 def _to_trajectory(position: ndarray, quaternion: ndarray, feet: ndarray) -> GaitTrajectory:
-    """Rotate the feet from world coordinates into the trunk's frame."""
+    """Return the trajectory with the feet rotated from world coordinates into the trunk's frame."""
     rotation = geometry.rotation_matrix(quaternion.T)
     local = np.einsum("jis,slj->sli", rotation, feet - position[:, None])
     return GaitTrajectory(position=position, quaternion=quaternion, feet=local)

@@ -1,10 +1,10 @@
-"""Metrics of recorded walks: does a robot avoid obstacles, and does it go on? Each with a 95 % interval.
+"""Metrics of recorded walks: does a robot avoid obstacles, and does it make progress? Each with a 95 % interval.
 
 Distance is the path length of the trunk's centre. The path is averaged over one gait cycle, so that sway doesn't count,
 and is interrupted at resets. A collision is a frame in which the clearance reached zero. The robot is then reset, so
 each contact counts once.
 
-A robot that turns on the spot has no collision. What tells it from one that avoids obstacles and goes on (`Progress`):
+A robot that turns on the spot has no collision. `Progress` separates it from one that avoids obstacles and walks on:
 
 | quantity        | unit  | meaning                                                                              |
 | --------------- | ----- | ------------------------------------------------------------------------------------ |
@@ -62,7 +62,7 @@ class Estimate:
 
 @struct.dataclass(kw_only=True)
 class Progress(Shown):
-    """Whether robots go on: how much floor they see, and how much they turn; means over robots."""
+    """Whether robots make progress: how much floor they cover, and how much they turn; means over robots."""
 
     coverage: Estimate  # 1/min, new cells of `CELL`
     hard_turning: Estimate  # share of time
@@ -118,7 +118,7 @@ def score(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Score:
 
 
 def progress(record: Record, cycle_time: float = cpg.CYCLE_TIME) -> Progress:
-    """Measure whether robots go on; frames with `ok` false don't count, nor do robots without any other.
+    """Return whether robots make progress; frames with `ok` false don't count, nor do robots with only such frames.
 
     Args:
         record: recorded walks, axes (robot, frame).

@@ -8,7 +8,7 @@ The results are in a folder with the names of the trial, the policy and the seed
 | chunk-*.parquet | the recorded walks of one batch each (`lgmdjax.simulation.episodes`) |
 | paths.png       | paths seen from above                                                |
 | walk.mp4        | video of the most eventful walk                                      |
-| walk.html       | the same in 3D, where the extra `viewer` is installed                |
+| walk.html       | the same in 3D, if the extra `viewer` is installed                   |
 
 After an interruption the same call continues with the next batch.
 """
@@ -78,7 +78,7 @@ def run_trial(
         policy: name of the policy.
         seed: of rooms, textures and start poses.
         seeds: number of repetitions; by default as many as the trial says.
-        width: of the eyes' pictures [px], by default as in training; the LGMD's cells cover the same angle at any.
+        width: of the eyes' pictures [px], by default as in training; the LGMD's cells keep their angular size.
         run: run folder of the robot; by default the pretrained robot.
         out: folder in which the folder with the results is created.
 
@@ -119,7 +119,7 @@ def _check(trial: str, policy: str, seeds: int | None) -> None:
 def describe_run(
     robot: closed_loop.Params, trial: TrialName, policy: PolicyName, seeds: int, seconds: float
 ) -> TrialRun:
-    """Describe a trial with one policy of a robot; robots with other parameters have another description."""
+    """Describe a trial with one policy of a robot; robots with different parameters have different descriptions."""
     return TrialRun(trial=trial, policy=policy, seeds=seeds, seconds=seconds, robot=assembly.fingerprint(robot))
 
 

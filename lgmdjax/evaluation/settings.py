@@ -1,4 +1,4 @@
-"""Names of the trials and settings of one trial in stage evaluate; free of JAX, for a fast command line."""
+"""Names of the trials, and settings of one trial in stage evaluate. Imports no JAX, for a fast command line."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -39,8 +39,8 @@ class TrialPlan:
     """One trial of stage evaluate: with which policies, how often, and for how long."""
 
     trial: TrialName  # name of the trial
-    eyes: Resolution  # of the learned policy's eyes
+    eyes: Resolution  # image size of the learned policy's eyes
     seeds: int  # number of repetitions, each with its own textures and start poses
-    coarse: Resolution | None = None  # of all other policies' eyes; the same as `eyes` if None
-    seconds: float | None = None  # duration of each walk [s]; as long as the trial says if None
-    policies: tuple[PolicyName, ...] = POLICY_NAMES  # names of the policies
+    coarse: Resolution | None = None  # image size of all other policies' eyes; the same as `eyes` if None
+    seconds: float | None = None  # duration of each walk [s]; that of the trial if None
+    policies: tuple[PolicyName, ...] = POLICY_NAMES  # policies to run

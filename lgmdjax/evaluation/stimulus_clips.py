@@ -5,7 +5,7 @@
 | selection | 2 s of every stimulus; those that approach make contact 0.2 s before the end                     |
 | timing    | approaches of a dark square, all as long as the slowest needs: 10 l/|v|, and 0.2 s after contact |
 | contrast  | an approach whose contrast with its surroundings is reduced                                      |
-| noise     | an approach, and a still image, with noise that is new in every pixel and frame                  |
+| noise     | an approach, and a still image, with independent noise in every pixel and frame                  |
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -21,7 +21,7 @@ from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.evaluation.settings import StimulusBench
 from lgmdjax.sensors import camera, stimuli
 
-L_OVER_V = (0.03, 0.1, 0.3)  # s, of the approaches and recessions that are told from each other
+L_OVER_V = (0.03, 0.1, 0.3)  # s, of the approaches and recessions to distinguish
 RATES = (0.25, 0.5, 1.0, 2.0)  # rad/s, of translation
 HALF_ANGLE = 0.3  # rad, of the square that translates; half of it is the half height of the bar
 CONTRASTS = (1.0, 0.5, 0.2, 0.1)  # of an approach with the middle l/|v|
@@ -41,7 +41,7 @@ class Clips(NamedTuple):
     names: tuple[str, ...]
     frames: Frames  # grey
     geometry: Geometry  # (clips, frames)
-    time: Float[np.ndarray, "frames"]  # before (negative) or after the contact of those that approach [s]
+    time: Float[np.ndarray, "frames"]  # from contact in clips that approach, negative before it [s]
 
 
 def selection(settings: StimulusBench) -> Clips:
@@ -84,7 +84,7 @@ def contrast(settings: StimulusBench) -> Clips:
 
 
 def noise(settings: StimulusBench, seed: int) -> Clips:
-    """Return an approach and a still image with every noise, in turn."""
+    """Return an approach and a still image at every noise level, in alternation."""
     frames, geometry, time = _plain_approach(settings)
     generator = np.random.default_rng(seed)
     still = np.broadcast_to(frames[:1], frames.shape)
@@ -97,7 +97,7 @@ def noise(settings: StimulusBench, seed: int) -> Clips:
 
 
 def approach_geometry(l_over_v: float, time: Float[np.ndarray, "frames"]) -> Geometry:
-    """Return size and expansion of an object that makes contact at t = 0, and is not seen to grow afterwards."""
+    """Return size and expansion of an object that makes contact at t = 0 and does not grow afterwards."""
     before = np.maximum(-time, 0.0)
     size = 2.0 * np.arctan2(l_over_v, before)
     rate = np.where(time < 0, 2.0 * l_over_v / (before**2 + l_over_v**2), 0.0)

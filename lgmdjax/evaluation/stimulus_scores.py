@@ -1,4 +1,4 @@
-"""How well looming detectors tell approach from everything else, on laboratory stimuli.
+"""How well looming detectors distinguish approach from everything else, on laboratory stimuli.
 
 | score       | meaning                                                                                               |
 | ----------- | ----------------------------------------------------------------------------------------------------- |
@@ -11,7 +11,7 @@
 | noise       | peak of an approach and of a still image, by the standard deviation of the noise                      |
 
 A detector of a fixed delay delta and angular threshold theta_t has slope 1 / tan(theta_t / 2) and intercept -delta
-(Gabbiani et al. 1999). Detectors have their published constants; cells of the fly's ones are about 5 degrees wide.
+(Gabbiani et al. 1999). Detectors have their published constants; cells of the fly's detectors are about 5 degrees wide.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -47,13 +47,13 @@ from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import camera
 
 FIRST = 2  # frames in which a detector settles
-SILENT = 1e-3  # peak below which a response has no time
+SILENT = 1e-3  # peak below which a response counts as none, and has no time
 FLY_CELL = np.radians(5.0)  # width of a cell of the fly's detectors
 OTHERS = ("recede", "translate", "elongate", "grating", "yaw", "sway", "flash")  # what does not approach
 
 
 class DetectorSetup(NamedTuple):
-    """A detector, its parameters for an eye, and whether it gets the geometry in the place of frames."""
+    """A detector, its parameters for an eye, and whether it gets the geometry instead of frames."""
 
     detector: protocol.Detector
     params: Callable[[camera.Params], PyTree]
@@ -94,7 +94,7 @@ DETECTORS: Mapping[str, DetectorSetup] = {
 
 
 def find(name: str) -> DetectorSetup:
-    """Return a detector by its name here, by `module:attribute`, or by `module:` for a module that is one.
+    """Return a detector by its name here, by `module:attribute`, or by `module:` for a module that is a detector.
 
     >>> find("lgmdjax.detectors:lgmd2").detector.__name__
     'lgmdjax.detectors.lgmd2'
@@ -195,7 +195,7 @@ def time_peaks(response: Float[np.ndarray, "clips frames"], clips: Clips) -> Jso
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float | None]:
-    """Return slope, intercept and correlation, which a level line does not have."""
+    """Return slope, intercept and correlation; the correlation of a level line is None."""
     slope, intercept = np.polyfit(x, y, 1)
     r = float(np.corrcoef(x, y)[0, 1]) if np.ptp(y) > 0 else None
     return float(slope), float(intercept), r

@@ -14,10 +14,10 @@
 
 In `testing` and `unseen` a robot that touches something is reset and walks on; the result is the number of collisions
 per 100 m (`lgmdjax.evaluation.metrics`). In the other trials the result is whether the robot touched anything. They end
-when it has touched something, has passed the obstacle, or the time is up; a robot that turns back walks on until then.
+when it touches something, when it has passed the obstacle, or when the time is up. A robot that turns back walks on.
 
-Each seed samples textures and the exact start pose, which is off by up to a centimetre and two degrees, before a gap by
-up to 0.2 m and 15 degrees. The textures' random key is used by no training room. Every second seed mirrors the room.
+Each seed samples textures and an offset of the start pose: up to 1 cm and 2 degrees, before a gap up to 0.2 m and 15
+degrees. No training room uses the textures' random key. Every second seed mirrors the room.
 """
 
 from collections.abc import Callable

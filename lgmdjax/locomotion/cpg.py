@@ -97,7 +97,7 @@ def limit_cycle_state(params: Params) -> State:
     """Return a state on the limit cycle of the default parameters, in tripod phase and scaled by the tonic drive.
 
     With other parameters the two tripods are still in exact antiphase, which the network preserves, and only the
-    waveform has a transient. A state with all legs in phase would not do: it is a solution too, but an unstable one.
+    waveform has a transient. A state with all legs in phase is a solution too, but an unstable one.
     """
     u, v = (
         _in_antiphase(even_leg) * jnp.asarray(params.tonic)

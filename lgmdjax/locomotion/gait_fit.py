@@ -163,7 +163,7 @@ def _demonstrations(geometry: LegGeometry, gait: Gait, cpg_params: cpg.Params, p
         [np.broadcast_to(rhythm[:, None], (*grid, 2)), np.broadcast_to(velocities[None, :, None], (*grid, 1))], axis=2
     )
     scale = np.maximum(np.abs(inputs).max((0, 1)) * np.array([0.7, 0.7, 0.5]), 1e-6)
-    # Compiled, because operation by operation they would take longer to compile than all else here.
+    # Compiled as one program: operation by operation, compilation would take longer than everything else here.
     angles = jax.jit(partial(tripod_gait.joint_targets, geometry, gait))(
         jnp.broadcast_to(jnp.asarray(phases, dtype=float)[:, None, None], (*grid, 6)),
         jnp.broadcast_to(jnp.asarray(velocities, dtype=float)[None, :, None], (*grid, 6)),

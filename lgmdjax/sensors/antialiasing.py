@@ -1,4 +1,4 @@
-"""Area coverage of a pixel by a half-plane: which part lies on the inner side of a straight edge, and where.
+"""Area coverage of a pixel by a half-plane: which part is on the inner side of a straight edge, and where.
 
 | symbol   | name                                         | unit | where                                           |
 | -------- | -------------------------------------------- | ---- | ----------------------------------------------- |
@@ -32,7 +32,7 @@ class EdgeOrientation(NamedTuple):
 
 
 class PixelRays(NamedTuple):
-    """One ray a pixel, with its change from pixel to pixel."""
+    """One ray per pixel, with its change from pixel to pixel."""
 
     d: Vector
     d_u: Vector

@@ -1,9 +1,9 @@
 """Stereo fisheye camera: images of the left and the right eye, each pixel integrated over its area.
 
-The camera casts one ray per pixel and knows how the ray changes from pixel to pixel. The part of a pixel that a surface
-covers follows from the margin by which the ray is inside the surface's outline. This needs no sampling and is
-differentiable everywhere (`compositing`). Prisms are culled by image tile: each tile keeps the `tile_capacity` nearest
-ones that may be visible in it.
+The camera casts one ray per pixel and uses its change from pixel to pixel. The part of a pixel that a surface covers
+follows from the margin by which the ray is inside the surface's outline. This needs no sampling and is differentiable
+everywhere (`compositing`). Prisms are culled by image tile: each tile keeps the `tile_capacity` nearest ones that may
+be visible in it.
 
 | symbol   | name                                   | unit   | where                                        |
 | -------- | -------------------------------------- | ------ | -------------------------------------------- |
@@ -44,12 +44,12 @@ _COARSE_RESOLUTION = 25.0
 
 
 MAX_SIZE = 4096
-"""Largest width and height of a picture [px]: at the paper's field of view, a pair takes about half a gigabyte."""
+"""Largest width and height of an image [px]: at the paper's field of view, a pair takes about half a gigabyte."""
 
 
 @struct.dataclass(kw_only=True, frozen=True)
 class Params(Shown):
-    """Structure of the camera, all of it static. Raises InputError for values that are not possible.
+    """Structure of the camera, all of it static. Raises InputError for impossible values.
 
     >>> image_shape(Params(width=80, height=60, overlap=0.5))
     (2, 60, 40)
@@ -64,7 +64,7 @@ class Params(Shown):
     ground: float = struct.field(pytree_node=False, default=0.0)
     """Fraction of the height, at the bottom, that no eye renders: 0 (none) .. less than 1."""
     samples: int = struct.field(pytree_node=False, default=1)
-    """Rays per pixel along each side; one is enough, since a ray stands for an area."""
+    """Rays per pixel along each side; one is enough, since a ray represents an area."""
     tile_capacity: int = struct.field(pytree_node=False, default=6)
     """Number of prisms that a tile holds, the nearest ones (`max_tile_occupancy` counts how many there are)."""
     bands: int = struct.field(pytree_node=False, default=3)
@@ -77,7 +77,7 @@ class Params(Shown):
                 raise InputError(f"expected camera {name} as a whole number above 0, got {value!r}; change it")
         if max(self.width, self.height) > MAX_SIZE:
             raise InputError(
-                f"expected camera pictures of at most {MAX_SIZE} px either way, got {self.width} x {self.height}; "
+                f"expected camera images of at most {MAX_SIZE} px each way, got {self.width} x {self.height}; "
                 "choose a smaller width"
             )
         if self.bands > len(WAVES):

@@ -1,4 +1,4 @@
-"""Faults of a stereo camera: what happens to its pictures between lens and detector, drawn by a random key.
+"""Faults of a stereo camera: changes of its pictures between lens and detector, sampled with a random key.
 
 A picture passes, in this order, vignetting, motion blur, automatic exposure, noise, the sensor's gamma, rounding to 8
 bits, and JPEG; then it may be dropped, and it arrives late. Without a fault, `step` returns the picture unchanged, but
@@ -11,13 +11,13 @@ rounded. All numbers are arrays, so that `vmap` gives each robot of a batch its 
 | c      | loss of light                                   | 1         | L (1 - c min(rho, 1)^2)                      |
 | s      | open part of the frame interval                 | 1         | L - s/2 (L - previous L): linear in time     |
 | g      | logarithm of the gain of the exposure           | 1         | g += w (a - log(mean L / M) - g)             |
-| a      | its aim, which drifts (Ornstein-Uhlenbeck)      | 1         |                                              |
-| e, r   | electrons a grey level, read noise              | 1/grey, 1 | variance L/e + (r/e)^2                       |
-| gamma  | of the sensor                                   | 1         | 255 (L/255)^gamma                            |
+| a      | target of g, which drifts (Ornstein-Uhlenbeck)  | 1         |                                              |
+| e, r   | electrons per grey level, read noise            | 1/grey, 1 | variance L/e + (r/e)^2                       |
+| gamma  | gamma of the sensor                             | 1         | 255 (L/255)^gamma                            |
 | q      | quality of JPEG                                 | 1..100    | steps of ITU-T T.81, scaled as libjpeg does  |
 
-Lens and pose of an eye are no operation on a picture, since what they bring into view is not in it: `Lens` is for
-those who cast the rays, and `warp` approximates its distortion on a picture.
+Errors of lens and pose are not operations on a picture, because the picture lacks what they bring into view. `Lens` is
+for code that casts the rays; `warp` approximates the distortion on a picture.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ from lgmdjax.minmax import clip
 MAX_LATENCY = 3  # frames
 BLOCK = 8  # px, of JPEG
 MEAN_GREY = 118.0  # M, to which automatic exposure brings a picture
-EXPOSURE_RATE, DRIFT_TIME = 0.05, 150.0  # w, a frame; frames in which a drift of the exposure is forgotten
+EXPOSURE_RATE, DRIFT_TIME = 0.05, 150.0  # w, per frame; time constant of the exposure's drift, frames
 LUMINANCE = np.array(
     [
         [16, 11, 10, 16, 24, 40, 51, 61],
@@ -60,7 +60,7 @@ class Lens:
 
 @struct.dataclass(kw_only=True)
 class Params:
-    """Faults of both cameras of a robot; the defaults are none."""
+    """Faults of both cameras of a robot; by default there are none."""
 
     vignetting: Float[Array, ""] | float = 0.0  # c
     blur: Float[Array, ""] | float = 0.0  # s
@@ -95,7 +95,7 @@ class Delivery(NamedTuple):
 
 
 def init(params: Params, pictures: Float[Array, "2 height width"], key: Array) -> State:
-    """Return the state before the first pictures; none is on its way."""
+    """Return the state before the first pictures, with no picture in transit."""
     late = MAX_LATENCY + 1
     return State(
         previous=pictures,
@@ -108,7 +108,7 @@ def init(params: Params, pictures: Float[Array, "2 height width"], key: Array) -
 
 
 def step(params: Params, state: State, pictures: Float[Array, "2 height width"]) -> tuple[State, Delivery]:
-    """Take a stereo picture, and return what arrives at the detector, maybe an earlier one or none.
+    """Take a stereo picture, and return what arrives at the detector: that picture, an earlier one, or none.
 
     Gradient: that of an unrounded picture; none through drops and latency.
 
@@ -150,7 +150,7 @@ def adapt(params: Params, state: State, light: Array, key: Array) -> tuple[Array
 
 
 def _noise(params: Params, light: Array, key: Array) -> Array:
-    """Return photon and read noise in grey levels; Poisson's distribution is normal enough above twenty electrons."""
+    """Return photon and read noise in grey levels; above twenty electrons Poisson's is nearly normal."""
     variance = jnp.maximum(light, 0.0) / params.electrons + (params.read / params.electrons) ** 2
     return jnp.sqrt(variance) * jax.random.normal(key, light.shape, light.dtype)
 
@@ -171,7 +171,7 @@ def _round(grey: Array) -> Array:
 def compress(pictures: Float[Array, "*eyes height width"], quality: Float[Array, ""] | float) -> Array:
     """Return grey pictures after JPEG at a quality of 1..100: their 8 x 8 cosine transform rounded to its steps.
 
-    The rest of JPEG loses nothing. Pictures whose sides are no multiples of 8 are continued by their last pixels.
+    The rest of JPEG is lossless. Sides that are not multiples of 8 are padded with their last pixels.
 
     Gradient: that of the unrounded transform, the identity.
     """
@@ -206,9 +206,9 @@ def _centred(count: int, dtype: jnp.dtype) -> Array:
 
 
 def distort(u: np.ndarray, v: np.ndarray, edge: float, distortion: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a lens that is off by `distortion` at the distance `edge` maps to pixels (u, v) from the middle.
+    """Return the undistorted positions of pixels (u, v) from the middle, for `distortion` at the distance `edge`.
 
-    rho grows by distortion (rho/edge)^2, as the first radial term of every lens model.
+    rho grows by distortion (rho/edge)^2, as in the first radial term of every lens model.
     """
     factor = 1.0 + distortion * (u * u + v * v) / edge**2
     return u * factor, v * factor
@@ -217,7 +217,7 @@ def distort(u: np.ndarray, v: np.ndarray, edge: float, distortion: float) -> tup
 def warp(
     pictures: Float[Array, "*eyes height width"], distortion: Float[Array, ""] | float
 ) -> Float[Array, "*eyes height width"]:
-    """Return pictures as a lens off by `distortion` would show them, bilinearly; beyond the picture its edge goes on.
+    """Return pictures as a lens with `distortion` would show them, by bilinear interpolation, with edges extended.
 
     Gradient: exact between pixels.
     """

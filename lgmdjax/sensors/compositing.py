@@ -29,9 +29,9 @@ from lgmdjax.world.arena import Arena
 from lgmdjax.world.texture import Texture, Vector
 
 _MAX_DEPTH = 1.0e3
-"""What is farther away [m] is shaded as if it were here."""
+"""What is farther away [m] is shaded as if it were at this distance."""
 _UNBOUNDED = 1.0e4
-"""A margin [px], or an inverse depth [1/m], that stands for no limit."""
+"""A margin [px], or an inverse depth [1/m], that means no limit."""
 _WALL_BIAS = 0.97
 """Factor on the inverse depth of walls, so that they do not cut off the edge pixels of what touches them."""
 
@@ -86,7 +86,7 @@ def composite(arena: Arena, eye: Array, rays: PixelRays, prisms: list[Silhouette
     Args:
         arena: the room, of which walls, floor and sky are used.
         eye: position [m].
-        rays: one a pixel, arrays of shape (tiles, pixels).
+        rays: one per pixel, arrays of shape (tiles, pixels).
         prisms: the prisms of each tile, nearest first, arrays of shape (tiles, 1).
         bands: number of texture scales.
     """

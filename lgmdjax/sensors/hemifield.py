@@ -32,7 +32,7 @@ def row_count(height: int, ground: float = 0.0) -> int:
 
 
 def crop(image: Array | np.ndarray, side: int, *, overlap: float, ground: float = 0.0) -> Array | np.ndarray:
-    """Return the hemifield of an eye: columns from its own side, the mirrored ones for the right eye.
+    """Return the hemifield of an eye: the first columns for the left eye, the last ones for the right eye.
 
     >>> picture = np.arange(16).reshape(2, 8)
     >>> crop(picture, RIGHT, overlap=0.5).tolist()
@@ -65,5 +65,5 @@ def edges(fov: float, overlap: float) -> tuple[float, float]:
 
 
 def outermost_first(frames: Shaped[Array, "2 height columns"]) -> Shaped[Array, "2 height columns"]:
-    """Mirror the picture of the right eye: in both pictures the first column is then that of the largest bearing."""
+    """Mirror the image of the right eye: in both images the first column is then that of the largest bearing."""
     return jnp.stack([frames[LEFT], frames[RIGHT, :, ::-1]])

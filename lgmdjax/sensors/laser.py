@@ -5,16 +5,17 @@
 | phi_i     | bearing of ray i in the scanner's plane, left positive   | rad  | -85 .. 85 deg   |
 | d_l, d_r  | smallest distance in the left and the right hemifield    | m    | limited to 5    |
 | w         | half width of the corridor that the robot walks along    | m    | 0.15            |
-| a         | how steeply what is beside the corridor counts less      | 1    | 7               |
+| a         | slope of e with the distance beside the corridor         | 1    | 7               |
 | e_l, e_r  | smallest corridor distance on either side                | m    | limited to 5    |
 
-d is how near an obstacle is, e how far the way ahead is free: a hit at (x, y), x ahead and y to the left, counts as far
-as
+d is the distance of an obstacle, e how far the way ahead is free. A hit at (x, y), x ahead and y to the left, counts as
+at the distance
 
     e(x, y) = x + a max(|y| - w, 0),
 
 so that a wall beside the robot is near (d) but not in its way (e). The robot's feet are 0.2 m to its sides. With these
-constants what is right beside it counts as nearer than 0.8 m, where the teacher begins to turn, within 0.26 m.
+constants an obstacle directly beside the robot counts as nearer than 0.8 m, where the teacher begins to turn, if it is
+within 0.26 m.
 
 Source: secs. 3.1 and 4.2 of the paper: 170 degrees, two rays per degree, ranges limited to 5 m. The scanner is fixed to
 the body, so that it measures the floor when the robot pitches, as a real one would.

@@ -10,7 +10,7 @@ FIELD_LIMITS: Mapping[str, tuple[float, float]] = {
     "ground": (0.0, 0.99),
     "falloff": (0.0, 100.0),
 }
-"""Smallest and largest values of what `CameraSettings` says of an LGMD's field."""
+"""Smallest and largest values of the settings of an LGMD's field in `CameraSettings`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +27,10 @@ class Resolution:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings(Resolution):
-    """Image size per eye, and the field of each side's LGMD. Raises InputError for a field out of its limits.
+    """Image size per eye, and the field of each side's LGMD. Raises InputError for a field outside its limits.
 
     A robot keeps the field that it was trained with at every resolution. With the default `overlap` the two LGMDs share
-    no column of the images: both eyes see what is straight ahead and far away, and it does not tell the sides apart
+    no column of the images. What is straight ahead and far away is seen by both eyes and does not distinguish the sides
     (`lgmdjax.studies.overlap`).
     """
 
@@ -39,14 +39,14 @@ class CameraSettings(Resolution):
     ground: float = 0.0
     """fraction of the height, at the bottom, that no LGMD receives; 0.5 is all below the horizon"""
     falloff: float = 0.0
-    """how much less the LGMDs weigh what is beside than what is ahead (`lgmdjax.detectors.lgmd`); 0 is not at all"""
+    """how much less weight cells have at the side than ahead (`lgmdjax.detectors.lgmd`); 0 for equal weights"""
 
     def __post_init__(self) -> None:
         check_field(overlap=self.overlap, ground=self.ground, falloff=self.falloff)
 
 
 def check_field(**field: float) -> None:
-    """Raise `InputError` for an `overlap`, a `ground` or a `falloff` out of its limits.
+    """Raise `InputError` for an `overlap`, a `ground` or a `falloff` outside its limits.
 
     >>> check_field(overlap=0.2)
     Traceback (most recent call last):

@@ -31,7 +31,7 @@ from lgmdjax.world.arena import Arena
 from lgmdjax.world.obstacles import Prisms, is_inactive
 
 MIN_DISTANCE = 1.0e-4
-"""Smallest distance of a surface from an eye [m]; nearer ones are taken to be at this distance."""
+"""Smallest distance of a surface from an eye [m]; nearer ones are treated as if at this distance."""
 
 Pair = tuple[Array, Array]
 

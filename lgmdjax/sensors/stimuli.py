@@ -72,7 +72,7 @@ def elongation(params: camera.Params, half_height: Scalar, l_over_v: Scalar, tim
 
     Args:
         params: of the camera.
-        half_height: half the height of the bar, which stays [rad].
+        half_height: half the height of the bar, which is constant [rad].
         l_over_v: l/|v| of the square [s].
         time: t [s].
     """
@@ -81,7 +81,7 @@ def elongation(params: camera.Params, half_height: Scalar, l_over_v: Scalar, tim
 
 
 def textured_approach(params: camera.Params, l_over_v: Scalar, time: Scalar) -> Image:
-    """Return the image of a textured square on a collision course, before surroundings that are as bright.
+    """Return the image of a textured square on a collision course, in front of equally bright surroundings.
 
     Args:
         params: of the camera.
@@ -157,7 +157,7 @@ def _plate(params: camera.Params, half_angle: Array) -> Image:
     """Return the image of an endless textured plate ahead, at the distance where a half size has `half_angle`."""
     surface = texture.prepare(jnp.asarray(OBJECT_TEXTURE, float))
     d, d_u, d_v = _directions(params)
-    x, scale = np.maximum(d[0], 0.05), surface.frequency / jnp.tan(half_angle)  # nearly all rays with less miss it
+    x, scale = np.maximum(d[0], 0.05), surface.frequency / jnp.tan(half_angle)  # nearly all rays below it miss
 
     def on_plate(derivative: np.ndarray) -> texture.Vector:
         y, z = ((derivative[i] * x - d[i] * derivative[0]) / x**2 for i in (1, 2))

@@ -194,10 +194,10 @@ def test_trials_and_policies_are_compared_line_by_line(
     monkeypatch.setattr("lgmdjax.evaluation.run_trial.run_trial", run_trial)
     assert main.main(["trial", "testing", "indoor", "--policy", "blind", "learned", "blind"]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"testing, blind: 3 collisions in 41 m, 18.2 new cells a minute; look into {tmp_path / 'testing-blind'}",
-        f"testing, learned: 3 collisions in 41 m, 18.2 new cells a minute; look into {tmp_path / 'testing-learned'}",
-        f"indoor, blind: 11 of 12 untouched; 3 passed, 8 turned back; look into {tmp_path / 'indoor-blind'}",
-        f"indoor, learned: 11 of 12 untouched; 3 passed, 8 turned back; look into {tmp_path / 'indoor-learned'}",
+        f"testing, blind: 3 collisions in 41 m, 18.2 new cells a minute; results in {tmp_path / 'testing-blind'}",
+        f"testing, learned: 3 collisions in 41 m, 18.2 new cells a minute; results in {tmp_path / 'testing-learned'}",
+        f"indoor, blind: 11 of 12 untouched; 3 passed, 8 turned back; results in {tmp_path / 'indoor-blind'}",
+        f"indoor, learned: 11 of 12 untouched; 3 passed, 8 turned back; results in {tmp_path / 'indoor-learned'}",
     ]
 
 

@@ -211,7 +211,7 @@ def check_responses(path, folder):
     [
         ([], "got 0 paths"),
         (["no/folder"], "found none at no/folder"),
-        (["{folder}", "--detector", "eta"], "which is told the geometry"),
+        (["{folder}", "--detector", "eta"], "which is given the geometry"),
         (["{folder}", "--detector", "lgmd3"], "a detector among lgmd, "),
         (["{folder}", "{folder}/other.csv"], "got no such file"),
     ],
