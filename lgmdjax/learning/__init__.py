@@ -1,4 +1,4 @@
-"""Fits: of the navigator, the detector, and of any controller parameter through the rollout."""
+"""Fits of the navigator, of the detector, and of any parameter of the controller through the rollout."""
 
 import lazy_loader
 

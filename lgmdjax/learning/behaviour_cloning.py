@@ -14,8 +14,8 @@ is carried into the next window without its gradient, and is reset where a segme
 Source: Cizek & Faigl, sec. 3.4, 4.2 and 5.1: RMSprop, mean squared error, 1000 epochs, data split in half.
 
 Windows, streams and `mirrored` are our additions. The two hemifields are mirror images of each other, so every walk is
-also a walk in the mirrored room, with left and right exchanged. A network fitted to both is then made `symmetric`. It
-is fitted as it is, not as the mean of both views, since it then overfits less:
+also a walk in the mirrored room, with left and right exchanged. A network fitted to both is then made `symmetric`: its
+output becomes the mean of both views. During the fit it sees one view, since it then overfits less:
 
 | fitted as          | correlation of its turns with the labels, held-out rooms |
 | ------------------ | -------------------------------------------------------- |
@@ -62,7 +62,7 @@ SAVE_EVERY = 10.0  # s between checkpoints; writing one takes as long as some ep
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How to fit. Numbers that the paper gives are the paper's."""
+    """Settings of a fit. Values that the paper gives are the paper's."""
 
     epochs: int = 1000
     learning_rate: float = 1e-2  # at the first window; decays to zero along half a cosine
@@ -81,7 +81,7 @@ class Progress:
     optimiser: optax.OptState
     best: PyTree  # weights with the lowest test error so far
     epoch: Int[Array, ""]
-    train: Float[Array, "epochs"]  # MSE of the training data during each epoch, nan for those to come
+    train: Float[Array, "epochs"]  # MSE of the training data during each epoch, nan for later epochs
     test: Float[Array, "epochs"]  # MSE of the test data after each epoch
 
 
@@ -225,7 +225,7 @@ def _run_epochs(
 
     def advance(progress: Progress, epoch: int, end: int) -> Progress:
         progress = _train_epochs(params, progress, data, end - epoch, settings)
-        # Through the host, since the result lies on all devices, and checkpoints and callers want it on one.
+        # Through the host, since the result is on all devices, and checkpoints and callers expect it on one.
         return jax.tree.map(jnp.asarray, jax.device_get(progress))
 
     total = settings.epochs
@@ -278,7 +278,7 @@ def _train_epoch(
     carry = progress.weights, progress.optimiser, _init_states(params, train)
     (weights, memory, _), (squares, frames) = jax.lax.scan(window, carry, train)
     error = _batch_mse(replace(params, weights=weights), test)
-    # The first epoch has none to compare with; an error that is not a number is never better.
+    # The first epoch has no earlier error to compare with; nan is never better.
     better = (error < jnp.nanmin(progress.test)) | (progress.epoch == 0)
     return Progress(
         weights=weights,
@@ -354,8 +354,8 @@ def _require_sound(settings: Settings, train: Sequence[Walk], test: Sequence[Wal
 def _identity(initial: Progress, data: tuple[SequenceBatch, SequenceBatch], settings: Settings) -> JsonObject:
     """Return what distinguishes this fit from any other: its settings, data and initial weights.
 
-    Of the weights only the signs count. Their last digits depend on the processor, since some are made orthogonal by a
-    matrix decomposition, and a fit may be continued on another machine.
+    Only the signs of the weights are used. Their last digits depend on the processor, since some are made orthogonal by
+    a matrix decomposition, and a fit may be continued on another computer.
     """
 
     def digest(tree: PyTree) -> str:

@@ -2,8 +2,8 @@
 
 Each checkpoint stores the identity of its fit, a fingerprint of data, settings and initial weights. A fit with
 another identity refuses the checkpoint. Only the newest checkpoint is kept; one that was interrupted while it was
-written is ignored. Beside the identity stands the checksum of the progress; checkpoints of versions before 0.3.0 have
-none. Numbers that were finite at the start of a fit are finite in what is resumed from.
+written is ignored. The checksum of the progress is stored with the identity; checkpoints of versions before 0.3.0 have
+none. A checkpoint is refused if an array that was finite at the start of the fit is not finite in it.
 """
 
 import json
@@ -63,7 +63,7 @@ class Checkpoints:
             contents = ocp.args.Composite(progress=ocp.args.StandardRestore(template))  # pyright: ignore
             restored = self.manager.restore(step, args=contents)["progress"]
             if found.get(checksums.SEAL) not in (None, _digest(restored)):
-                raise checksums.ChecksumError("another checksum than that of what was saved")
+                raise checksums.ChecksumError("another checksum than the saved one")
             if not all(jax.tree.leaves(jax.tree.map(_is_as_finite, initial, restored))):
                 raise checksums.ChecksumError("numbers that are not finite")
         except InputError:
@@ -85,7 +85,7 @@ class Checkpoints:
         try:
             self.manager.save(step, args=args)
             self.manager.wait_until_finished()
-        except Exception as error:  # of a full disk orbax raises whatever its storage layer does
+        except Exception as error:  # on a full disk orbax raises whatever its storage layer does
             raise InputError(f"{self.folder}: expected to write, got {_first_line(error)}; free some disk") from error
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ class Checkpoints:
             raise InputError(f"{self.folder}: expected to write, got {_first_line(error)}; free some disk") from error
 
     def _require_same_identity(self, found: JsonObject) -> None:
-        # A name that only one of both has belongs to another version of the package.
+        # A name that only one of the two has is from another version of the package.
         names = sorted(name for name in self.identity.keys() & found.keys() if found[name] != self.identity[name])
         if names:
             raise InputError(
@@ -122,7 +122,7 @@ def resumable(
         checkpoints: where progress is saved and resumed from; None saves nothing.
         total: number of steps.
         chunk: steps in one call of `advance`.
-        interval: least time between two checkpoints [s]; the last step is always saved.
+        interval: minimum time between two checkpoints [s]; the last step is always saved.
 
     >>> list(resumable(lambda progress, step, end: progress + (end - step), 0, None, total=5, chunk=2))
     [(0, 0), (2, 2), (4, 4), (5, 5)]

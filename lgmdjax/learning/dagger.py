@@ -69,7 +69,7 @@ def record_demonstrations(
 def fit_navigator(
     folder: Path, walks: Sequence[Walk], epochs: int, seed: int, variant: names.Variant = "lstm"
 ) -> tuple[navigator.Params, list[Walk]]:
-    """Fit a new navigator to walks; return the best one, and the segments that it was chosen by."""
+    """Fit a new navigator to walks; return the best one, and the segments with which it was chosen."""
     train, test, _ = split_rooms(episodes.segments(walks), seed)
     untrained, settings = navigator.create(jax.random.key(seed), variant), behaviour_cloning.Settings(epochs=epochs)
     return behaviour_cloning.fit(untrained, train, test, settings, checkpoints=folder).best, test
@@ -141,7 +141,7 @@ def select_turn_gain(
 
 
 def _summarise(record: closed_loop.Record) -> JsonObject:
-    """Return what turn gains are compared by."""
+    """Return the metrics by which turn gains are compared."""
     score = metrics.score(record, cpg.CYCLE_TIME)
     row = {"tight": count_approaches(record), "collisions": score.collisions, "distance": score.distance}
     return row | {"coverage": score.progress.coverage.value}

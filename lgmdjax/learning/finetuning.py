@@ -1,4 +1,4 @@
-"""Fine-tune a controller while the robot walks, by the gradient of the imitation loss; measure its noise as well.
+"""Finetune a controller while the robot walks, by the gradient of the imitation loss; measure its noise as well.
 
 Adam follows the mean gradient of a batch of robots (`lgmdjax.learning.rollout_gradient`), window after window and room
 after room. Each update is in units of `param_scales`. The constants of LGMD and CPG are multiplied by a factor, so that
@@ -41,7 +41,7 @@ Update = Callable[[controller.Params, optax.OptState, PyTree], tuple[controller.
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How to follow the gradient."""
+    """Settings of the optimiser."""
 
     learning_rate: float = 1e-3  # in units of param_scales; decays to zero along half a cosine
     windows_per_room: int = 30  # before the robots continue in other rooms
@@ -69,7 +69,7 @@ class Progress:
     controller_params: controller.Params
     optimiser: optax.OptState
     rooms: Int[Array, ""]  # finished
-    rows: Float[Array, "windows columns"]  # `WindowStats` of all windows; nan for those to come
+    rows: Float[Array, "windows columns"]  # `WindowStats` of all windows; nan for later windows
 
 
 def finetune(
@@ -96,7 +96,7 @@ def finetune(
         label: name of the fit in the curves that are tracked (`lgmdjax.runtime.tracking`).
     """
     scales, steps = param_scales(params.controller, settings.trainable), settings.windows_per_room * settings.rooms
-    # Adam's epsilon must be small beside every derivative.
+    # Adam's epsilon must be small compared with every derivative.
     optimiser = optax.adam(optax.cosine_decay_schedule(settings.learning_rate, steps), eps=1e-15)
     update = _make_update(optimiser, scales)
 

@@ -17,10 +17,11 @@ shrinks from `SMOOTH_WIDTHS[0]` to `SMOOTH_WIDTHS[1]`, relative to T_s and T_f.
 | v*           | sequences.label                 | nominal   | 22       |
 | L            | loss                            | nominal^2 | sec. 5.1 |
 
-Fitted are the logarithms of T_s, T_f and W_I, and w_I in units of `KERNEL_RMS`, projected to non-negative values. Only
-the product of W_I and the sum of w_I matters; `normalise_kernel` sets that sum to the paper's.
+The fitted parameters are the logarithms of T_s, T_f and W_I, and w_I in units of `KERNEL_RMS`, projected to
+non-negative values. Only the product of W_I and the sum of w_I matters; `normalise_kernel` sets that sum to the
+paper's.
 
-Gradient: by all of these, and by the navigator's weights; zero by T_s and T_f if thresholds are hard.
+Gradient: with respect to all of these and the navigator's weights; zero for T_s and T_f if thresholds are hard.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -47,11 +48,11 @@ from lgmdjax.simulation.episodes import Walk
 
 PARTS = ("detector", "navigator")
 SMOOTH_WIDTHS = (0.3, 0.03)  # of the sigmoids, relative to T_s and T_f: first and last
-MIN_CONSTANT = 1e-3  # least constant whose logarithm is taken
+MIN_CONSTANT = 1e-3  # smaller constants are raised to this before their logarithm is taken
 KERNEL_SUM = float(np.sum(lgmd.KERNEL))
 KERNEL_RMS = float(np.sqrt(np.mean(np.square(lgmd.KERNEL))))  # of the kernel's weights
 MAX_GRAD_NORM = 1.0
-ADAM_EPS = 1e-5  # keeps Adam from amplifying derivatives that are practically zero, as by T_f without suppression
+ADAM_EPS = 1e-5  # keeps Adam from amplifying derivatives that are practically zero, as for T_f without suppression
 
 
 @struct.dataclass(kw_only=True)
@@ -99,7 +100,10 @@ def frame_differences(images: Float[AnyArray, "walks frames 2 rows columns"], is
 
 
 def respond(detector: lgmd.Params, differences: FrameDifferences) -> Float[Array, "*walks frames 2"]:
-    """Return u of every frame and eye (eqs. 8-16); a difference is that of an image from a black one."""
+    """Return u of every frame and eye (eqs. 8-16).
+
+    The LGMD gets each difference as an image that follows a black one, so that it computes the same difference.
+    """
     detector = replace(detector, pooling=1)
 
     def eye(current: Float[Array, "rows columns"], previous: Float[Array, "rows columns"]) -> Float[Array, ""]:
@@ -168,7 +172,7 @@ def loss(
     """Return the mean squared error of the commands in one window, and the navigators' states after it.
 
     Args:
-        fitted: parameters to differentiate by; they replace those in `params`.
+        fitted: parameters to differentiate with respect to; they replace those in `params`.
         params: all other parameters.
         states: of the navigators, one per stream.
         batch: one window, without the axis of windows.

@@ -3,12 +3,12 @@
 T_s "has to be set experimentally" (paper sec. 3.3). Here the images of recorded walks are rendered again, and the
 detector is run with many pairs of T_s and W_I at once. The best pair is the one whose left-right difference of u,
 averaged over about a gait cycle, correlates best with the left-right difference of proximity, since steering depends on
-which side is nearer. Proximity is that of what is nearest: what is in the way is rare, and with it as the criterion a
-threshold was chosen that kept u at rest in 97 % of the frames.
+which side is nearer. Proximity is that of the nearest obstacle, in the way or not. Obstacles in the way are rare: with
+their proximity as the criterion, a threshold was chosen that kept u at rest in 97 % of the frames.
 
-T_f is then set above every FF value of walking and turning, so that suppression only answers motion that is not the
+T_f is then set above every FF value of walking and turning, so that suppression only responds to motion that is not the
 robot's own, such as being lifted. A lower T_f suppresses u during turns, and first on the nearer side, so that the
-difference of the two eyes points to the wrong side:
+difference of the two eyes indicates the wrong side:
 
 | T_f                    | correlation of u with proximity in hard turns, left - right |
 | ---------------------- | ----------------------------------------------------------- |
@@ -150,10 +150,10 @@ def select(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: 
 
 
 def correlate_with_proximity(record: Record) -> dict[str, float]:
-    """Return the correlations of the recorded u with proximity that `select` compares candidates by."""
+    """Return the correlations of the recorded u with proximity, by which `select` compares candidates."""
     steady = _is_steady_walking(record)
     averaged = ndimage.uniform_filter1d(np.asarray(record.u), round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
-    if not steady.any():  # as of a robot that falls at once
+    if not steady.any():  # as for a robot that falls at once
         return dict.fromkeys(("score", "left", "right"), 0.0)
     return _correlations(averaged, 1 / np.asarray(record.distances)[steady])
 

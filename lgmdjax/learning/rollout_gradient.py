@@ -1,12 +1,12 @@
-"""The imitation loss of a rollout, and its gradient through time by all parameters of the controller.
+"""The imitation loss of a rollout, and its gradient through time with respect to all parameters of the controller.
 
 Robots walk in their rooms under the navigator's control, and the teacher's rule labels every frame. The loss of a
 window of frames is
 
     L = mean over its frames and both sides of |v - v*|^2.
 
-Reverse mode differentiates it by everything between the cameras and the servos (`controller.Params`). `grad_path`
-chooses what the derivative passes through (`closed_loop.step`):
+Reverse mode differentiates it with respect to everything between the cameras and the servos (`controller.Params`).
+`grad_path` chooses what the derivative passes through (`closed_loop.step`):
 
 | grad_path  | the derivative passes through                                   | held constant   |
 | ---------- | --------------------------------------------------------------- | --------------- |
@@ -88,8 +88,8 @@ def losses(
     """Roll out a batch of robots for a window; return each robot's loss, and (states after the window, record).
 
     Args:
-        controller_params: one set per robot, to differentiate by; they replace those in `params`, and their policy is
-            a navigator.
+        controller_params: one set per robot, to differentiate with respect to; they replace those in `params`, and
+            their policy is a navigator.
         params: the robot.
         model: the body in MJX.
         rooms: one per robot.
@@ -119,7 +119,7 @@ def loss(
     *,
     settings: Settings,
 ) -> tuple[Float[Array, ""], tuple[State, Record]]:
-    """Roll out one robot, as `losses` does a batch."""
+    """Roll out one robot for a window; return its loss and the rest as `losses` does for a batch."""
     add_axis = partial(jax.tree.map, lambda leaf: jnp.asarray(leaf)[None])
     values, aux = losses(add_axis(controller_params), params, model, add_axis(room), add_axis(state), settings=settings)
     return values[0], jax.tree.map(lambda leaf: leaf[0], aux)
@@ -154,7 +154,7 @@ def gradient(
 def per_robot_grad(
     losses: Callable[[controller.Params], tuple[Float[Array, " robots"], PyTree]], controller_params: controller.Params
 ) -> tuple[tuple[Float[Array, " robots"], PyTree], controller.Params]:
-    """Return (losses, auxiliary output), and the gradient of each robot's loss by its own parameters.
+    """Return (losses, auxiliary output), and the gradient of each robot's loss with respect to its own parameters.
 
     Robots do not interact, so one backward pass of the sum of all losses gives all gradients.
     """

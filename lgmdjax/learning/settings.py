@@ -20,7 +20,7 @@ class DaggerSettings:
 class TrainSettings(DaggerSettings):
     """Training of the navigator and its variants: rounds of DAgger, then a final fit of every variant."""
 
-    eyes: Resolution  # of the robot's eyes, which see the field of the recorded walks
+    eyes: Resolution  # of the robot's eyes; their field of view is that of the recorded walks
     split_half_epochs: int = 80  # number of epochs of the fit to the teacher's walks split in halves, as in the paper
     variants: tuple[str, ...] = ("lstm", "lstm-efference", "feed-forward", "mean")  # networks to fit and compare
     turn_gains: tuple[float, ...] = ()  # turn gains to compare by walking; none: behaviour_cloning.TURN_GAIN
@@ -30,7 +30,7 @@ class TrainSettings(DaggerSettings):
 class LgmdGradientSettings:
     """Fit of the LGMD to recorded walks by gradient, with and without its navigator."""
 
-    minutes: float  # recorded walking to fit to and evaluate on, in all [min]
+    minutes: float  # total duration of the recorded walks to fit to and evaluate on [min]
     seconds: float  # duration of each walk [s]; shorter walks mean more rooms
     epochs: int  # number of epochs of the navigator's own fit, before the LGMD's
     steps: int  # number of optimiser steps

@@ -1,7 +1,7 @@
 """Stage collect: calibrate the LGMD on first walks, then record the teacher's walks in many rooms.
 
 Writes calibration.json and episodes/*.parquet, one file for each episode. The rooms of an episode depend on the seed
-and its number only, so that an interrupted run resumes with the episode that it was at.
+and its number only, so that an interrupted run resumes with the episode that was interrupted.
 """
 
 import dataclasses
@@ -21,10 +21,10 @@ from lgmdjax.simulation.assembly import load_detector
 
 CALIBRATION_EPISODE = 2**20  # an episode number beyond all others: its rooms are used nowhere else
 CALIBRATION_RULE = braitenberg.Params(corridor=0.0, turn_distance=0.95, full_turn_distance=0.6)
-"""The rule of the calibration walks, which turns from everything near.
+"""The rule of the calibration walks, which turns away from everything near.
 
 T_f has to be above the FF values of hard turns. The teacher's own walks have too few of them: T_f became half as large,
-and silenced the detectors of a robot that had to turn.
+and the detectors of a robot that had to turn were suppressed.
 """
 
 

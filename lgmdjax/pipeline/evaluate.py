@@ -74,9 +74,9 @@ def _record(
 
 
 def _collision_causes(settings: EvaluateSettings, records: Records, seed: int) -> dict[str, dict[str, int]]:
-    """Count the causes of the learned policy's collisions in each trial; empty if it walked too little to say.
+    """Count the causes of the learned policy's collisions in each trial; empty if it walked too little for that.
 
-    The baseline of u comes from the held-out rooms, whatever the camera: cells of one size respond alike.
+    The baseline of u is that of the held-out rooms for every camera, since cells of the same size respond alike.
     """
     try:
         baseline = collision_causes.fit_baseline(records["unseen"]["learned"])

@@ -37,7 +37,7 @@ from lgmdjax.simulation.closed_loop import Record
 from lgmdjax.studies import supervision, velocity
 from lgmdjax.world import arena, scenes
 
-WALK_PAGE, WALK_SECONDS = "walk.html", 30.0  # beside index.html, and how much of the walk it shows
+WALK_PAGE, WALK_SECONDS = "walk.html", 30.0  # file next to index.html, and duration of the walk in it [s]
 INPUTS = {  # of the policies
     "teacher": "laser scanner",
     "learned": "both LGMDs",
@@ -48,7 +48,7 @@ INPUTS = {  # of the policies
 
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: ReportSettings, seed: int) -> None:
-    """Write index.html from the folders of all earlier stages, and walk.html where the extra `viewer` is installed."""
+    """Write index.html from the folders of all earlier stages, and walk.html if the extra `viewer` is installed."""
     if walk_page.HAS_VISER:
         walk = Record(**read_arrays(folder.parent / "evaluate/walk.npz"))
         walk_page.walk_page(walk, scenes.testing_room(), seconds=WALK_SECONDS).write(folder / WALK_PAGE)
@@ -82,7 +82,8 @@ def render(
         text = page.render(**_contents(run_folder, room, video_seconds), walk_page=walk_link)
     except (KeyError, jinja2.UndefinedError) as error:
         raise InputError(
-            f"expected a run folder of this version of lgmdjax, {run_folder} lacks {error}; delete it and run again"
+            f"expected a run folder of this version of lgmdjax, got {run_folder} without {error}; "
+            "delete it and run again"
         ) from error
     out.mkdir(parents=True, exist_ok=True)
     path = out / "index.html"
@@ -116,7 +117,7 @@ def _contents(run_folder: Path, room: arena.Arena, video_seconds: float) -> Json
 def _figures(
     run_folder: Path, results: report_data.Results, onset: Mapping[str, np.ndarray], room: arena.Arena
 ) -> dict[str, str]:
-    """Return all figures as data addresses, by name."""
+    """Return all figures as data URLs, by name."""
     figures = {
         **report_figures.plot_gait(run_folder, results.gait, onset),
         **report_figures.plot_detection(run_folder, results.calibration),
@@ -130,7 +131,7 @@ def _figures(
 
 
 def _study_contents(studies: Mapping[str, Sequence[JsonObject]]) -> JsonObject:
-    """Return what the page says about the studies beside their figures."""
+    """Return what the page says about the studies in addition to their figures."""
     return {
         "best_velocity": velocity.best_row(studies["velocity"]) if "velocity" in studies else None,
         "paper_best": velocity.PAPER_BEST,

@@ -1,4 +1,4 @@
-"""Contents of a run folder for the report page, with the names of this version, and what follows from them."""
+"""Contents of a run folder for the report page, with the names of this version, and values derived from them."""
 
 import math
 from collections.abc import Sequence

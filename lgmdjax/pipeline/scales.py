@@ -8,7 +8,7 @@
 |       | also five studies of `lgmdjax.studies`                                                                     |
 
 A stage without settings in a scale is left out. A setting is here if the scale or a study changes it; physical
-constants belong to the components' `Params`. Imports no JAX, so that the command line can.
+constants belong to the components' `Params`. Imports no JAX, so that the command line needs none.
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ _PAPER = Resolution(width=320, height=240, pooling=12)
 
 
 def _with_field(resolution: Resolution) -> CameraSettings:
-    """Return a camera whose LGMDs see what is above the horizon, and weigh most what is ahead."""
+    """Return a camera whose LGMDs see only above the horizon, with the largest weights straight ahead."""
     return CameraSettings(**vars(resolution), ground=0.5, falloff=2.0)
 
 
@@ -144,7 +144,7 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
 STUDY_PRESETS: Mapping[str, StudySettings] = {
     "overlap": OverlapSettings(robots=8, seeds=4),
     "gradient_horizon": GradientHorizonSettings(eyes=_SMALL, robots=6),
-    # The best of the evolution strategy among 1, 2 and 8 pairs, sigma 0.0003 to 0.02, rates of 1.25e-3 to 1.5e-2.
+    # The evolution strategy's settings are the best of 1, 2 and 8 pairs, sigma 0.0003 to 0.02, rates 1.25e-3 to 1.5e-2.
     "gait_gradient": GaitGradientSettings(
         robot_seconds=9000.0,
         window=1.6,
@@ -179,4 +179,4 @@ STUDY_PRESETS: Mapping[str, StudySettings] = {
     ),
     "transfer": TransferSettings(),
 }
-"""Settings of the studies that are no stages of a run."""
+"""Settings of the studies that are not stages of a run."""

@@ -1,4 +1,4 @@
-"""Settings of the stages, beside those of stage train. Imports no JAX, so that the command line can."""
+"""Settings of the stages, except those of stage train. Imports no JAX, so that the command line needs none."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""A walk that plays in a notebook, in the output of its cell."""
+"""Video of a walk in the output of a notebook's cell."""
 
 import io
 from base64 import b64encode

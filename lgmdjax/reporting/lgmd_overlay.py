@@ -5,8 +5,8 @@
 | eyes   | pictures, orange where S exceeds the threshold T_s                                    |
 | E, I   | excitation and inhibition, multiplied by eight                                        |
 | S      | summation: orange where it exceeds T_s, blue where inhibition outweighs excitation    |
-| below  | u of the last frames, left blue and right orange; thinner the adapted response, red   |
-|        | where there is an alarm                                                               |
+| below  | u of the last frames, left blue and right orange; thin lines: the adapted response;   |
+|        | red: alarms                                                                           |
 """
 
 from collections.abc import Sequence
@@ -33,8 +33,8 @@ HISTORY_FRAMES = 150  # frames of u in the curves
 MIN_PANEL_HEIGHT = 200  # px; smaller pictures are enlarged
 BACKGROUND, TEXT_COLOUR, GRID_COLOUR = (24, 24, 24), (235, 235, 235), (90, 90, 90)
 ABOVE_THRESHOLD_COLOUR, INHIBITED_COLOUR = np.array([255.0, 130.0, 30.0]), np.array([40.0, 90.0, 255.0])
-MAX_SIZE = 8192  # px, of a video that players show
-MIN_BRIGHTNESS = 0.35  # of a coloured cell, which would be too dark to see
+MAX_SIZE = 8192  # px, of the largest video that players show
+MIN_BRIGHTNESS = 0.35  # of a coloured cell, so that it is not too dark to see
 GREY, ABOVE_THRESHOLD, INHIBITED = 0, 256, 512  # first index of each row of the palette
 ALARM_COLOUR = "#FF4040"
 EYE_COLOURS = ("#56B4E9", "#E69F00")  # blue and orange as in the figures, in lighter shades for a dark background
@@ -160,7 +160,7 @@ def _to_level(values: Float[ArrayLike, "2 rows columns"]) -> Int[Array, "2 rows 
 
 @cache
 def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
-    """Return the font of a size, which would take longer to load than to use."""
+    """Return the font of a size; cached, since it takes longer to load than to use."""
     return ImageFont.load_default(size)
 
 

@@ -1,4 +1,4 @@
-"""What HTML pages share: a template environment that escapes every text, numbers, and files inside the page."""
+"""Parts that HTML pages share: a template environment that escapes all text, formats of numbers, embedded files."""
 
 import base64
 import math
@@ -34,5 +34,5 @@ def fixed(value: float | None, decimals: int) -> str:
 
 
 def inline(kind: str, content: bytes) -> str:
-    """Return a file as a data address, for example of the kind image/png."""
+    """Return a file as a data URL, for example of the kind image/png."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,7 +1,7 @@
-"""A recorded walk as arrays that can be shown at once: no JAX is imported or run to draw it.
+"""A recorded walk as arrays that can be drawn at once, without JAX.
 
-The robot's coordinates (qpos) place its limbs by C MuJoCo's kinematics. What the eyes saw and how the layers of the
-LGMDs responded is there as bytes, since to compute them takes the simulation.
+C MuJoCo's kinematics compute the pose of the limbs from the robot's coordinates (qpos). The pictures of the eyes and
+the layers of the LGMDs are stored as bytes, since only the simulation can compute them.
 
 A file holds one walk (`save`, `load`): numbers as they are, pictures as H.264, layers compressed without loss.
 """
@@ -30,7 +30,7 @@ LAYERS = ("E", "I", "S")
 
 
 class RoomShape(NamedTuple):
-    """What a room looks like, apart from where its obstacles are; boxes first, then cylinders."""
+    """Shape of a room, without the positions of its obstacles; boxes first, then cylinders."""
 
     bounds: Float[ndarray, "4"]  # x_min, x_max, y_min, y_max [m]
     wall_height: float  # m
@@ -57,7 +57,7 @@ class Playback(NamedTuple):
     layers: UInt8[ndarray, "frames 2 3 rows columns"] | None = None  # `LAYERS`; white is `LAYER_WHITE`
 
     def centres_at(self, frame: int) -> Float[ndarray, "n 2"]:
-        """Return where the obstacles are in a frame."""
+        """Return the centres of the obstacles in a frame [m]."""
         return self.centres[min(frame, len(self.centres) - 1)]
 
 
@@ -109,7 +109,7 @@ def cut(playback: Playback, frames: int) -> Playback:
 
 
 def with_senses(playback: Playback, first: int, pictures: ndarray, layers: ndarray) -> Playback:
-    """Return a walk with what was sensed in its frames from `first` on; arrays that it has are written into."""
+    """Return a walk with pictures and layers of its frames from `first` on; its own arrays are changed in place."""
     series: dict[str, ndarray] = {}
     for name, part in (("pictures", pictures), ("layers", layers)):
         known = getattr(playback, name)
@@ -131,7 +131,7 @@ def contacts_of(playback: Playback) -> Sequence[int]:
 
 
 def _unpack(arrays: Mapping[str, ndarray], name: str) -> ndarray:
-    """Return an array that was compressed; no more memory is asked for than it says that it needs."""
+    """Return an array that was compressed; no more memory is allocated than its declared shape needs."""
     shape, dtype = tuple(arrays[f"{name}_shape"].tolist()), np.dtype(PACKED[name])
     if len(shape) > MAX_AXES or not 0 < math.prod(shape) <= MAX_NUMBERS:
         raise ValueError(f"{name} of shape {shape}")
@@ -159,7 +159,7 @@ def _decode(content: bytes, frames: int) -> UInt8[ndarray, "frames 2 height widt
 
 
 def _schema(frames: int, prisms: int) -> schema.Object:
-    """Return what the arrays of a file have to be."""
+    """Return the schema of the arrays of a file."""
 
     def numbers(*shape: int) -> schema.Numbers:
         return schema.Numbers(shape, -1e4, 1e4)

@@ -1,4 +1,4 @@
-"""What a room looks like, as arrays that need no JAX to be drawn (`lgmdjax.reporting.playback.RoomShape`)."""
+"""Shape of a room as arrays that can be drawn without JAX (`lgmdjax.reporting.playback.RoomShape`)."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from lgmdjax.world import arena
 
 
 def shape_of(room: arena.Arena) -> RoomShape:
-    """Return what a room looks like."""
+    """Return the shape of a room."""
 
     def both(name: str) -> np.ndarray:
         return np.concatenate([np.asarray(getattr(prisms, name)) for prisms in (room.boxes, room.cylinders)])

@@ -1,8 +1,8 @@
-"""Which part of which walk to show: one in which the robot turns and goes on.
+"""Choose which part of which walk to show: one in which the robot turns and moves on.
 
-Of a stretch of walking, the product of its mean turn |v_r - v_l| and of the distance between its ends is taken. A robot
-that turns on the spot has a distance of zero, one that walks straight ahead a turn of zero; a robot that walks around
-something has both.
+The score of a stretch of walking is the product of its mean turn |v_r - v_l| and the distance between its ends. For a
+robot that turns on the spot the distance is zero, and for one that walks straight ahead the turn is zero; a robot that
+walks around something has both.
 
 Works on host arrays.
 """
@@ -41,9 +41,9 @@ def choose_walk(record: Record, room: Room | Arena, index: int | None = None) ->
 
 
 def select_walk(record: Record) -> int:
-    """Return the number of the robot with the best stretch of walking; axes (robot, frame).
+    """Return the index of the robot with the best stretch of walking; axes (robot, frame).
 
-    Robots with more collisions come later, robots that were lost last.
+    Robots with fewer collisions are preferred; robots that were lost come last.
     """
     frames = min(round(STRETCH * FRAME_RATE), np.shape(record.time)[1])
     best = [
@@ -63,14 +63,14 @@ def select_segment(
 
 
 def detect_resets(position: Float[ndarray, "frames 3"]) -> Bool[ndarray, " steps"]:
-    """Find the steps between frames in which the robot was reset: it can't walk 5 cm in 1/30 s."""
+    """Find the steps between frames in which the robot was reset: it cannot walk 5 cm in 1/30 s."""
     return np.linalg.norm(np.diff(position, axis=0), axis=1) > 0.05
 
 
 def _turn_and_distance(
     position: Float[ndarray, "total 3"], velocity: Float[ndarray, "total 2"], frames: int
 ) -> Float[ndarray, " starts"]:
-    """Return mean turn times distance [m] of every stretch of `frames`; less 1000 for each reset in it."""
+    """Return mean turn times distance [m] of every stretch of `frames`, minus 1000 for each reset in it."""
     starts = np.arange(0, len(position) - frames + 1, _EVERY)
     turn = np.concatenate([[0.0], np.cumsum(np.abs(velocity[:, 1] - velocity[:, 0]))])
     resets = np.concatenate([[0.0, 0.0], np.cumsum(detect_resets(position))])

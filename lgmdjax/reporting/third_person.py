@@ -31,7 +31,7 @@ AMBIENT, DIFFUSE = 0.55, 0.55
 GLASS_OPACITY, GLASS_COLOUR = 0.18, (0.80, 0.88, 0.95)  # of prisms that would hide the robot
 GLASS_START, GLASS_END = 0.35, 0.10  # m from the line of sight, where a prism starts to be and is fully transparent
 CLEAR_FRACTION = 0.55  # of the line of sight, from the camera on, along which prisms become transparent
-ROOM_LIFT, FLOOR_LIFT = 0.15, 0.45  # how much paler the room is than to the robot's eyes, so that the robot stands out
+ROOM_LIFT, FLOOR_LIFT = 0.15, 0.45  # how much paler the room is than in the eyes' images, so that the robot stands out
 SHADOW_STRENGTH = 0.55  # fraction of the light that a foot on the floor blocks
 TINTS = {
     "box": (0.80, 0.93, 1.0),
@@ -92,7 +92,7 @@ def render_view(
 ) -> Float[Array, "height width 3"]:
     """Render robot and room as RGB 0..1; `target` [m] is the point on the robot that nothing hides.
 
-    Gradient: not meant to be used; edges are hard.
+    Gradient: not useful, since edges are hard.
     """
     solid, glass = _cast_room(params, arena, view, target)
     rows, columns = slice(*params.robot_rows), slice(*params.robot_columns)
@@ -130,7 +130,7 @@ def _cast_room(params: Params, arena: Arena, view: Viewpoint, target: Array) -> 
     )
     kinds = (raycast.to_boxes, arena.boxes, 0), (raycast.to_cylinders, arena.cylinders, boxes)
     for cast, prisms, first in kinds:
-        # One prism after another: cast all at once, XLA would cast them again for every use of the depths.
+        # One prism after another: if all were cast at once, XLA would repeat it for every use of the depths.
         def nearer(hits: _Hits, one: tuple[Prisms, Array, Array], cast=cast) -> tuple[_Hits, None]:
             prism, index, opacity = one
             t = cast(jax.tree.map(lambda leaf: leaf[None], prism), o, d)[..., 0]
@@ -258,7 +258,7 @@ def _render_robot(params: Params, view: Viewpoint, robot: RobotCapsules, backgro
 def _cast_robot(o: Array, d: Array, robot: RobotCapsules) -> tuple[Array, Array]:
     """Return depth and index of the first capsule along each ray.
 
-    One capsule after another: cast all at once, XLA would cast them again for every use of the depths.
+    One capsule after another: if all were cast at once, XLA would repeat it for every use of the depths.
     """
 
     def nearer(best: tuple[Array, Array], capsule: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:

@@ -1,6 +1,6 @@
 """The upright picture of a video: its display matrix and the shape of its pixels.
 
-A stored pixel (x, y) is shown at (a x + c y, b x + d y), but for a shift. Signs and zeros of a, b, c, d give the eight
+A stored pixel (x, y) is shown at (a x + c y, b x + d y), up to a shift. Signs and zeros of a, b, c, d give the eight
 orientations of a picture; other angles are rounded to the nearest of them.
 
 Source: ISO/IEC 14496-12, 6.2.2, as FFmpeg reads it (`libavutil/display.h`).
@@ -35,7 +35,7 @@ def from_matrix(a: float, b: float, c: float, d: float) -> Orientation:
 
 
 def of_frame(frame: av.VideoFrame) -> Orientation:
-    """Return the orientation of a decoded frame, which carries the display matrix of its stream."""
+    """Return the orientation of a decoded frame, which has the display matrix of its stream."""
     stored = frame.side_data.get("DISPLAYMATRIX")
     if stored is None:
         return Orientation()
@@ -50,12 +50,12 @@ def to_upright(picture: UInt8[np.ndarray, "rows columns"], orientation: Orientat
 
 
 def swap_axes(size: tuple[int, int], orientation: Orientation) -> tuple[int, int]:
-    """Exchange width and height if the orientation does."""
+    """Exchange width and height if the orientation transposes."""
     return (size[1], size[0]) if orientation.transpose else size
 
 
 def square_size(width: int, height: int, pixel_aspect: Fraction) -> tuple[int, int]:
-    """Return the size of a picture with square pixels; nothing is enlarged, the closer pixels are averaged.
+    """Return the size of a picture with square pixels; it is never enlarged, but averaged along the other axis.
 
     >>> square_size(720, 576, Fraction(16, 15)), square_size(432, 240, Fraction(80, 81))
     ((720, 540), (427, 240))

@@ -1,8 +1,8 @@
 """Read and write video files one frame at a time, with PyAV, which includes FFmpeg.
 
 Pictures are arrays 0..255 with row 0 at the top: grey (height, width) when read, RGB or RGBA (height, width,
-channels) when written. Held in memory are one frame that is read, the compressed data of `PROBED_PACKETS`, and
-`MAX_QUEUED_PICTURES` that are written.
+channels) when written. Memory holds one frame that is read, the compressed data of `PROBED_PACKETS` packets, and
+`MAX_QUEUED_PICTURES` pictures to be written.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from lgmdjax.reporting import video_geometry, video_source, video_timing
 
 MAX_MISSING_FRAMES = 2  # at the end of an undamaged file: containers round their duration
 PROBED_PACKETS = 240  # whose timestamps give the rate
-MAX_QUEUED_PICTURES = 4  # that wait to be encoded
+MAX_QUEUED_PICTURES = 4  # waiting to be encoded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class Video:
 def open_reader(path: Path) -> Iterator[Video]:
     """Open a video file or a pipe to read it once, from the first frame to the last.
 
-    Raises InputError if the file is missing or no video; while frames are read, if it is damaged or shorter than it
+    Raises InputError if the file is missing or not a video; while frames are read, if it is damaged or shorter than it
     declares.
     """
     with video_source.open_container(path) as container:
@@ -98,7 +98,7 @@ def open_writer(
 ) -> Iterator[Callable[[UInt8[np.ndarray, "height width channels"]], None]]:
     """Open an MP4 file for H.264 pictures of even width and height, and yield a function that writes one picture.
 
-    Pictures are encoded on a thread of their own; the function returns while that works.
+    Pictures are encoded in a separate thread; the function does not wait for it.
 
     Args:
         target: path of the file, or a binary stream.
@@ -106,12 +106,12 @@ def open_writer(
         height: of the pictures [px].
         rate: frames per second.
         fast: encode in a third of the time, into a file larger by a third.
-        key_frame_every: most pictures from one key frame to the next, for readers that jump; FFmpeg's choice if None.
+        key_frame_every: largest number of pictures between key frames, for readers that seek; FFmpeg's choice if None.
     """
     if width % 2 or height % 2:
         raise InputError(f"expected an even width and height for H.264, got {width} x {height}; pad by one")
     with contextlib.ExitStack() as stack:
-        # FFmpeg would take some names for the address of a protocol.
+        # FFmpeg would interpret some names as the URL of a protocol.
         file = stack.enter_context(target.open("wb")) if isinstance(target, Path) else target
         container = stack.enter_context(av.open(file, "w", format="mp4"))
         stream = _add_stream(container, width, height, rate, fast=fast, key_frame_every=key_frame_every)
@@ -121,7 +121,7 @@ def open_writer(
         def write(picture: UInt8[np.ndarray, "height width channels"]) -> None:
             queue.append(encoder.submit(_encode, container, stream, picture))
             if len(queue) > MAX_QUEUED_PICTURES:
-                queue.popleft().result()  # raises what the thread did
+                queue.popleft().result()  # raises what the thread raised
 
         yield write
         queue.append(encoder.submit(_encode, container, stream, None))
@@ -145,14 +145,14 @@ def _add_stream(
     if key_frame_every is not None:
         stream.options |= {"g": str(key_frame_every)}
     if fast:
-        stream.thread_count = 1  # its own; more would wait for each other
+        stream.thread_count = 1  # more would wait for each other
     return stream
 
 
 def _encode(
     container: OutputContainer, stream: VideoStream, picture: UInt8[np.ndarray, "height width channels"] | None
 ) -> None:
-    """Write a picture to the stream; None writes what the encoder still holds."""
+    """Write a picture to the stream; None flushes the encoder."""
     frame = None
     if picture is not None:
         frame = av.VideoFrame.from_ndarray(picture, format="rgba" if picture.shape[-1] == 4 else "rgb24")
@@ -160,7 +160,7 @@ def _encode(
 
 
 def _begin(packets: Iterator[av.Packet]) -> tuple[list[av.VideoFrame], int]:
-    """Decode up to the first whole frames; return them, and the number of packets that are damaged before them."""
+    """Decode up to the first whole frames; return them, and the number of damaged packets before them."""
     left_out = 0
     with contextlib.suppress(FFmpegError):
         for packet in packets:
@@ -177,7 +177,7 @@ def _begin(packets: Iterator[av.Packet]) -> tuple[list[av.VideoFrame], int]:
 def _decode_packet(packet: av.Packet) -> list[av.VideoFrame]:
     """Decode a packet; raise FFmpegError if it is damaged.
 
-    A decoder replaces what is lost by an older picture, which would be a change where nothing moved.
+    A decoder replaces lost data by an older picture, which would look like motion.
     """
     frames = [frame for frame in packet.decode() if isinstance(frame, av.VideoFrame)]
     if packet.is_corrupt or any(frame.is_corrupt for frame in frames):
@@ -186,7 +186,7 @@ def _decode_packet(packet: av.Packet) -> list[av.VideoFrame]:
 
 
 def _decode(path: Path, frames: list[av.VideoFrame], packets: Iterator[av.Packet]) -> Iterator[av.VideoFrame]:
-    """Yield the frames that are decoded and those of the packets; raise InputError if they are damaged."""
+    """Yield the decoded frames, then those of the packets; raise InputError if they are damaged."""
     count, time = 0, None
     try:
         for frame in chain(frames, chain.from_iterable(map(_decode_packet, packets))):
@@ -219,10 +219,10 @@ def _to_declared_end(
 def read_grey(frames: Iterator[av.VideoFrame], rate: Fraction, width: int, height: int) -> Iterator[Frame]:
     """Convert frames to grey, upright and of the given size.
 
-    Brightness does not depend on the matrix of the colours (BT.601, 709, 2020), but FFmpeg's conversion is exact for
-    BT.601 alone: the others are a level too dark where a picture is scaled.
+    Brightness does not depend on the colour matrix (BT.601, 709, 2020), but FFmpeg's conversion is exact only for
+    BT.601: with the others a scaled picture is a level too dark.
     """
-    reformatter = VideoReformatter()  # that of a frame would be made anew for each
+    reformatter = VideoReformatter()  # shared, since a frame would make its own
     for index, frame in enumerate(frames):
         orientation = video_geometry.of_frame(frame)
         stored = video_geometry.swap_axes((width, height), orientation)

@@ -1,7 +1,7 @@
-"""Open video files so that FFmpeg sees their bytes alone.
+"""Open video files so that FFmpeg sees only their bytes.
 
-FFmpeg takes a name such as `12:30:05.mp4` or `concat:a.mp4` for the address of a protocol, and some formats (playlists,
-numbered pictures) only name other files, which it would open in turn. It is therefore given no name, a list of formats
+FFmpeg interprets a name such as `12:30:05.mp4` or `concat:a.mp4` as the URL of a protocol. Some formats (playlists,
+numbered pictures) only name other files, which it would open in turn. FFmpeg therefore gets no name, a list of formats
 that hold their own pictures, and no protocol.
 """
 
@@ -23,7 +23,7 @@ VIDEO_FORMATS = (
     *("mov", "matroska", "avi", "mpegts", "mpeg", "mpegvideo", "flv", "asf", "ogg", "rm", "mxf", "dv", "nut"),
     *("gif", "apng", "webp", "yuv4mpegpipe", "ivf", "obu", "av1", "vvc", "hevc", "h264", "h263", "m4v", "mjpeg"),
 )
-SOUND_FORMATS = ("wav", "mp3", "flac", "aac", "aiff", "caf", "amr")  # to say that they have no pictures
+SOUND_FORMATS = ("wav", "mp3", "flac", "aac", "aiff", "caf", "amr")  # for a clear error: they have no pictures
 ERROR_DETECTION = "crccheck+bitstream+buffer+explode"  # FFmpeg otherwise invents what is missing
 OPTIONS = {
     "format_whitelist": ",".join((*VIDEO_FORMATS, *SOUND_FORMATS)),
@@ -34,9 +34,9 @@ BUFFER_SIZE = 1 << 18  # bytes
 
 
 class Pipe:
-    """A file that cannot be sought; an interruption while waiting for it reaches the caller.
+    """A file without seek; an interruption while waiting for it reaches the caller.
 
-    FFmpeg calls `read`, and would drop an exception that is no `Exception`.
+    FFmpeg calls `read`, and would drop an exception that is not an `Exception`.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -44,7 +44,7 @@ class Pipe:
         self.interruption: BaseException | None = None
 
     def read(self, size: int) -> bytes:
-        """Return the next bytes; none at the end, and after an interruption."""
+        """Return the next bytes; none at the end or after an interruption."""
         try:
             return self._file.read(size)
         except BaseException as error:
@@ -53,7 +53,7 @@ class Pipe:
 
 
 class Seekable:
-    """A file without its name."""
+    """A file with seek, without its name."""
 
     def __init__(self, file: FileIO) -> None:
         self.read, self.seek, self.tell = file.read, file.seek, file.tell
@@ -81,7 +81,7 @@ def open_container(path: Path) -> Iterator[InputContainer]:
                 raise source.interruption from error
             hint = "try to play it" if file.seekable() else "save it to a file, since some cannot be read from a pipe"
             raise InputError(
-                f"expected a video, got {path}, which is no video, is truncated, or names other files "
+                f"expected a video, got {path}, which is not a video, is truncated, or names other files "
                 f"({reason(error)}); {hint}"
             ) from error
         with container:
@@ -93,7 +93,7 @@ def open_container(path: Path) -> Iterator[InputContainer]:
 def choose_stream(path: Path, container: InputContainer) -> VideoStream:
     """Return the stream of pictures, with the decoder's error detection on.
 
-    Raises InputError if there is none, or none that can be decoded. The cover of a sound file is none.
+    Raises InputError if there is none, or none that can be decoded. The cover picture of a sound file does not count.
     """
     still = Disposition.attached_pic | Disposition.timed_thumbnails
     streams = [stream for stream in container.streams.video if not stream.disposition & still]
@@ -109,5 +109,5 @@ def choose_stream(path: Path, container: InputContainer) -> VideoStream:
 
 
 def reason(error: Exception) -> str:
-    """Return what FFmpeg says of an error, as a part of a sentence."""
+    """Return FFmpeg's description of an error, as a part of a sentence."""
     return (getattr(error, "strerror", None) or str(error)).lower()

@@ -1,7 +1,7 @@
-"""Frame rate and duration of a video, which few files declare truly.
+"""Frame rate and duration of a video, which few files declare correctly.
 
-The average rate is wrong where a frame is shown for long, as the last one of slides is. So the rate is that of the
-median spacing of the frames, and the end of a video is that of its last frame, not its beginning.
+The average rate is wrong if a frame is shown for a long time, as the last frame of a slide show is. The rate is
+therefore that of the median spacing of the frames, and a video ends where its last frame ends, not where it begins.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ def _typical_spacing(times: np.ndarray) -> float:
 
 
 def end_of(frame: av.VideoFrame, index: int, rate: Fraction) -> float:
-    """Return when a frame is shown no longer [s]."""
+    """Return the time at which a frame ends [s]."""
     if frame.time is None or frame.time_base is None:
         return float((index + 1) / rate)
     return frame.time + (float(frame.duration * frame.time_base) or float(1 / rate))

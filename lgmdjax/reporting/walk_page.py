@@ -1,4 +1,4 @@
-"""A walk as one self-contained HTML page: robot and room in 3D, to turn, to scrub and to play at any speed.
+"""A walk as one self-contained HTML page with robot and room in 3D, which can be rotated and played at any speed.
 
 The page holds viser's client and the scene, and needs neither a server nor the network. It shows every second frame of
 the walk, the path and the contacts; the curves and the eyes' pictures are in the video (`walk_video`).
@@ -21,7 +21,7 @@ from lgmdjax.runtime.partial_files import replacing
 from lgmdjax.simulation.closed_loop import Record, Room
 from lgmdjax.world.arena import Arena
 
-STRIDE = 2  # recorded frames from one of the page to the next
+STRIDE = 2  # recorded frames per frame of the page
 MAX_SECONDS = 60.0
 
 
@@ -33,7 +33,7 @@ class WalkPage:
     height: int = 480  # px, in a notebook
 
     def _repr_html_(self) -> str:
-        """Return a frame that holds the page."""
+        """Return an iframe that holds the page."""
         escaped = html.escape(self.html, quote=True)
         return f'<iframe srcdoc="{escaped}" width="100%" height="{self.height}" style="border:1px solid #ddd"></iframe>'
 
@@ -49,7 +49,7 @@ def walk_page(
 ) -> WalkPage:
     """Return a page about one walk of a record, of the part that `selection.select_segment` selects.
 
-    Raises InputError where the extra `viewer` is not installed.
+    Raises InputError if the extra `viewer` is not installed.
 
     Args:
         record: recorded walks, axes (robot, frame), or one walk, axis (frame,).
@@ -69,14 +69,14 @@ def walk_page(
     """
     walk, scene = selection.choose_walk(record, room, index)
     if not 0 < seconds <= MAX_SECONDS:
-        raise InputError(f"expected seconds of more than 0 to {MAX_SECONDS:g}, got {seconds}; choose a shorter part")
+        raise InputError(f"expected seconds above 0 and up to {MAX_SECONDS:g}, got {seconds}; choose another duration")
     frames = selection.select_segment(np.asarray(walk.position), np.asarray(walk.velocity), round(seconds * FRAME_RATE))
     part = jax.tree.map(lambda leaf: leaf[frames], walk)
     return page_of(to_playback(part, scene), follow=follow)
 
 
 def to_playback(walk: Record, room: Arena) -> Playback:
-    """Return one walk, axis (frame,), as it can be shown, without pictures."""
+    """Convert one walk, axis (frame,), to a `Playback` without pictures."""
     joints = np.asarray(walk.joints).reshape(len(walk.time), -1)
     return Playback(
         title="walk",
@@ -95,7 +95,7 @@ def page_of(playback: Playback, *, follow: bool = False) -> WalkPage:
     """Return a page about a whole walk."""
     if not np.all(np.isfinite(playback.qpos)):
         raise InputError("expected a walk with finite poses, got one without; choose another walk")
-    server = walk_scene.quiet_server("127.0.0.1", 0)  # viser has no scene without one
+    server = walk_scene.quiet_server("127.0.0.1", 0)  # viser has no scene without a server
     try:
         scene = WalkScene(server)
         scene.follows = follow

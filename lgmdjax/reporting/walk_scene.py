@@ -1,7 +1,7 @@
-"""A robot and its room in viser's scene, for the viewer and for pages without a server. The extra `viewer` has viser.
+"""A robot and its room in viser's scene, for the viewer and for pages without a server. Needs the extra `viewer`.
 
 `mjviser` draws the robot from its MuJoCo model; walls, floor and obstacles are added here. To follow the robot, the
-whole world is shifted, so that it stays where the camera looks, and whoever watches can turn the camera.
+whole world is shifted, so that the robot stays where the camera looks and the user can still rotate the camera.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,12 +32,12 @@ BOX, CYLINDER, OVERHEAD, WALL, FLOOR = (
 PATH, CONTACT = (60, 110, 160), (193, 18, 31)
 LINE_HEIGHT, MARK_HEIGHT = 0.006, 0.30  # m above the floor
 CAMERA_OFFSET = np.array([-1.35, -0.95, 1.05])  # m, from the robot
-OVERVIEW = np.array([-0.1, -1.15, 1.25])  # the same for the whole room, in its largest sides
-WORLD = "/world"  # all that is shifted when the robot is followed
+OVERVIEW = np.array([-0.1, -1.15, 1.25])  # the same for the whole room, as multiples of its longest side
+WORLD = "/world"  # everything that is shifted to follow the robot
 
 
 def check_installed() -> None:
-    """Raise `InputError` where viser or mjviser is missing."""
+    """Raise `InputError` if viser or mjviser is missing."""
     if not HAS_VISER:
         raise InputError(
             "expected viser and mjviser to draw the robot in a browser, got an environment without them; "
@@ -46,7 +46,7 @@ def check_installed() -> None:
 
 
 def quiet_server(host: str, port: int, label: str | None = None) -> "viser.ViserServer":
-    """Start viser's server without what it prints about itself."""
+    """Start viser's server without its messages."""
     check_installed()
     rich.get_console().quiet = True
     return viser.ViserServer(host=host, port=port, label=label, verbose=False)
@@ -62,14 +62,14 @@ def _light(server: "viser.ViserServer") -> None:
 
 
 class WalkScene:
-    """The scene: one room, one robot."""
+    """A scene with one room and one robot."""
 
     def __init__(self, server: "viser.ViserServer"):
         self.server = server
         self.model = robot_xml.load()
         self.data = mujoco.MjData(self.model)
         self.follows = True
-        self.on_move: Callable[[int, float, float], None] | None = None  # obstacle that is dragged, and where to [m]
+        self.on_move: Callable[[int, float, float], None] | None = None  # (dragged obstacle, x, y [m])
         self._robot = mjviser.ViserMujocoScene(server, self.model, num_envs=1)
         self._robot.camera_tracking_enabled = False
         self._robot.geom_groups_visible[0] = False  # the floor and the barriers of the physics
@@ -83,7 +83,7 @@ class WalkScene:
         self._qpos = self.model.key("stance").qpos.copy()
 
     def enter(self, room: RoomShape, centres: Float[ndarray, "n 2"]) -> None:
-        """Draw another room."""
+        """Replace the room by another one."""
         for name in ("walls", "floor", "obstacles", "paths", "contacts"):
             self.server.scene.remove_by_name(f"{WORLD}/{name}")
         self._obstacles.clear()
@@ -94,7 +94,7 @@ class WalkScene:
         self.show(self._qpos, centres)
 
     def show(self, qpos: Float[ndarray, "25"], centres: Float[ndarray, "n 2"]) -> None:
-        """Draw the robot and the obstacles where they are."""
+        """Draw the robot in a pose, and the obstacles at their centres [m]."""
         self._qpos = np.asarray(qpos, float)
         self.data.qpos[:] = self._qpos
         mujoco.mj_kinematics(self.model, self.data)
@@ -138,7 +138,7 @@ class WalkScene:
         return float(x), float(y)
 
     def look(self, room: RoomShape) -> None:
-        """Let new cameras look at the robot, or at the whole room if it is not followed."""
+        """Point the initial camera at the robot, or at the whole room if the robot is not followed."""
         x_min, x_max, y_min, y_max = room.bounds
         camera = self.server.initial_camera
         if self.follows:
@@ -203,7 +203,7 @@ class WalkScene:
         self._obstacles[index] = handle
 
     def let_drag(self, on_move: Callable[[int, float, float], None]) -> None:
-        """Call `on_move` with an obstacle's number and its new place [m] while somebody drags it."""
+        """Call `on_move` with an obstacle's number and its new position [m] while the user drags it."""
         for index, handle in self._obstacles.items():
 
             @handle.on_drag("left")
@@ -217,7 +217,7 @@ class WalkScene:
                     on_move(index, *map(float, centre))
 
     def _add_line(self, name: str, points: Float[ndarray, "n 3"], colour: tuple[int, int, int]) -> None:
-        """Draw a line; one on the floor if it is a path of the trunk."""
+        """Draw a line, on the floor if it is a path of the trunk."""
         path = np.array(points, float)
         if "/paths/" in name:
             path[:, 2] = LINE_HEIGHT

@@ -1,4 +1,4 @@
-"""Checksums (SHA-256) of files: one that is not as it was written is refused, instead of read as other numbers.
+"""SHA-256 checksums of files: a file that has changed since it was written is refused.
 
 | what                         | its checksum is                                                                   |
 | ---------------------------- | --------------------------------------------------------------------------------- |
@@ -6,7 +6,7 @@
 | a file of lgmdjax/data       | in lgmdjax/data/done.json, which the experiments that train the weights write     |
 | done.json, run.json          | in themselves (`seal`)                                                            |
 | safetensors, Parquet         | in their own headers too, so that a copy elsewhere is checked                     |
-| a checkpoint                 | beside the identity of its fit (`lgmdjax.learning.checkpoints`)                   |
+| a checkpoint                 | stored with the identity of its fit (`lgmdjax.learning.checkpoints`)              |
 | a cached program             | at the end of its file (`program_cache`), on its first line (`export_cache`)      |
 
 Files of versions before 0.3.0 have none, and are read without this check: their done.json lists sizes.
@@ -26,7 +26,7 @@ MAX_DEPTH = 3  # folders from a file up to the one whose done.json lists it
 
 
 class ChecksumError(ValueError):
-    """A file that is not as it was written."""
+    """A file has changed since it was written."""
 
 
 def digest(*parts: bytes) -> str:
@@ -56,19 +56,19 @@ def is_sealed(content: object) -> bool:
 
 
 def require_seal(content: object) -> None:
-    """Raise `ChecksumError` for a JSON object that has a checksum, but not its own."""
+    """Raise `ChecksumError` for a JSON object whose checksum is not that of its contents."""
     if isinstance(content, Mapping) and SEAL in content and not is_sealed(content):
         raise ChecksumError("its checksum is not that of its contents")
 
 
 def list_files(folder: Path) -> dict[str, str]:
-    """Return the checksums of all results in a folder and below, by name; left-overs of killed processes are none."""
+    """Return the checksums of all files in a folder and below, by name, except unfinished files and done.json."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix not in UNFINISHED)
     return {path.relative_to(folder).as_posix(): digest(path.read_bytes()) for path in files if path.name != STAMP}
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file; raise `ChecksumError` if a done.json in its folder or above has no or another checksum for it."""
+    """Read a file; raise `ChecksumError` if the done.json in its folder or above does not have its checksum."""
     content = path.read_bytes()
     folder = next((folder for folder in list(path.parents)[:MAX_DEPTH] if (folder / STAMP).is_file()), None)
     if folder is None or path == folder / STAMP:
@@ -93,7 +93,7 @@ def read_stamp(folder: Path) -> Stamp:
     try:
         facts = json.loads((folder / STAMP).read_bytes())
     except (ValueError, RecursionError) as error:
-        raise ChecksumError(f"{folder / STAMP} is no JSON") from error
+        raise ChecksumError(f"{folder / STAMP} is not JSON") from error
     files = facts.get("files", {}) if isinstance(facts, dict) else None
     if not isinstance(files, dict):
         raise ChecksumError(f"{folder / STAMP} lists no files")
@@ -104,6 +104,6 @@ def read_stamp(folder: Path) -> Stamp:
 
 
 def _digest_json(content: Mapping[str, object]) -> str:
-    """Return the checksum of a JSON object without its own, whatever the order of its keys."""
+    """Return the checksum of a JSON object except its own checksum; the order of its keys has no effect."""
     rest = {key: value for key, value in content.items() if key != SEAL}
     return digest(json.dumps(rest, sort_keys=True).encode())

@@ -1,14 +1,14 @@
-"""Cache traced programs on disk, beside the programs that JAX has compiled.
+"""Cache traced programs on disk, next to the programs that JAX has compiled.
 
-JAX's own cache spares compilation by XLA, but not tracing by Python: to trace a closed-loop rollout and lower it takes
-ten seconds in every process, its gradient more than half a minute. `cached_jit` is a `jax.jit` that also stores the
+JAX's own cache saves compilation by XLA, but not tracing by Python: tracing and lowering a closed-loop rollout takes
+ten seconds in every process, and its gradient more than half a minute. `cached_jit` is a `jax.jit` that also stores the
 result of that work (`jax.export`, 1 to 2 MB), in a folder of JAX's cache. Another process reads it in seconds.
 
 A stored program is used again only if all of these are the same: function, static arguments, structure, shapes and
 precision of the other arguments, every byte of this package when it was imported, versions of JAX and MJX, devices, and
 JAX's settings. Attributes that are replaced in an imported module (monkeypatching) are not noticed; disable the cache
-for that. Static arguments may contain functions. A program is stored only if all of them are functions of this package
-and no closures, since the source of others may change unnoticed.
+for that. Static arguments may contain functions. A program is stored only if all of them belong to this package and
+none is a closure, since the source of others may change unnoticed.
 
 | exported/<function>-<key>-<release>.program | content                                                        |
 | ------------------------------------------- | -------------------------------------------------------------- |
@@ -21,11 +21,11 @@ and no closures, since the source of others may change unnoticed.
 Writing a program deletes those of other releases.
 
 Reading a file runs no code that the file chooses: the structure is data (`pytree_json`), and the program is StableHLO
-that may call linear algebra and random bits, but neither Python nor kernels that it brings (`ALLOWED_CALLS`). A hostile
+that may call linear algebra and random bits, but neither Python nor kernels of its own (`ALLOWED_CALLS`). A hostile
 program could still return wrong numbers or crash the process, and the checksum has no key: it detects damage, not
-malice. So the folder is made for its owner alone (mode 0700), and folders and files that another user owns or may write
-to are not used. Windows has no such modes; there, only the access lists of users' folders protect them. The folder
-around it, JAX's own cache, holds machine code: whoever may write to that one runs code.
+malice. The folder is therefore private to its owner (mode 0700), and folders and files that another user owns or may
+write to are not used. Windows has no such modes; there, only the access lists of users' folders protect them. The
+parent folder, JAX's own cache, holds machine code: whoever may write there can run code.
 """
 
 import functools
@@ -136,7 +136,7 @@ def hash_folder(folder: Path) -> str:
 
 
 PACKAGE_DIGEST = hash_folder(PACKAGE_DIR)
-"""Hash of this package when it was imported: files that are edited later are not what runs."""
+"""Hash of this package when it was imported: later edits do not change the code that runs."""
 
 
 @functools.cache
@@ -152,12 +152,12 @@ def _release() -> str:
 def _program_key(function: Callable[..., object], types: PyTree[str], static: object) -> str:
     """Return a hash of everything that a program depends on."""
     name = function.__module__, function.__qualname__
-    # All settings that could change what is traced, and many that do not: tracing once too often does less harm.
+    # All settings that could change what is traced, and many that do not: an unneeded trace does little harm.
     names = [name for name in sorted(jax.config.values) if "cache" not in name]
     settings = [str(getattr(jax.config, name, jax.config.values[name])) for name in names]
     devices = [jax.default_backend(), jax.local_device_count()]
     everything = name, types, static, _release(), settings, devices
-    # As text: pickle gives other bytes for equal values if parts of them are one object.
+    # As text: pickle gives different bytes for equal values if some of them share objects.
     with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
         return checksums.digest(repr(everything).encode())[:32]
 
@@ -169,7 +169,7 @@ def _cache_folder() -> Path | None:
 
 
 def _is_usable(folder: Path) -> bool:
-    """Make the folder for its owner alone; warn and return False if that fails, or if others may write to it."""
+    """Make a private folder; warn and return False if that fails, or if other users may write to it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _check_private(folder, folder.stat())
@@ -254,11 +254,11 @@ def _parse(content: bytes, key: str, packages: frozenset[str]) -> tuple[export.E
     text, _, program = rest.partition(b"\n")
     header = json.loads(text)
     if (header["format"], header["version"], header["key"]) != (FORMAT, VERSION, key):
-        raise ValueError("it is another program's")
+        raise ValueError("it belongs to another program")
     results = pytree_json.decode(header["results"], packages)
     exported = export.deserialize(bytearray(program))
     if len(exported.out_avals) != len(jax.tree.leaves(results)):
-        raise ValueError("it returns another number of arrays than it says")
+        raise ValueError("it returns another number of arrays than it declares")
     _check_calls(exported)
     return exported, results
 
@@ -273,7 +273,7 @@ def _check_calls(exported: export.Exported) -> None:
 def _caller(exported: export.Exported, results: PyTree) -> Callable[..., PyTree]:
     """Return a function that calls a program and gives its results the structure of `results`."""
     structure = jax.tree.structure(results)
-    # JAX looks up where SciPy has LAPACK when it lowers a call of it; else a program that was read crashes (jax#29610).
+    # JAX finds SciPy's LAPACK when it lowers a call of it; without this, a program that was read crashes (jax#29610).
     jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
 
     # JAX refuses to call a program for several devices if no argument is on them.

@@ -1,9 +1,9 @@
 """Ctrl-C, SIGTERM and SIGHUP end a command within two seconds, whatever it is doing.
 
-Python answers a signal with an exception between two of its instructions. That is not enough: compiled code may run for
+For a signal, Python raises an exception between two of its instructions. That is not enough: compiled code may run for
 minutes between two instructions, and an exception in a callback of the garbage collector, of which JAX has one, is
-printed and forgotten. So a signal also sets a flag, which loops over chunks of work look at (`check`), and wakes a
-thread that ends the process if nothing else did within `GRACE`. Files are safe in either case: they get their names
+printed and then lost. A signal therefore also sets a flag, which loops over chunks of work check (`check`), and wakes a
+thread that ends the process if it is still running after `GRACE`. Files are safe in either case: they get their names
 when they are complete (`lgmdjax.runtime.partial_files`).
 """
 
@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 GRACE = 1.5  # s from a signal to the end of the process
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows lacks the last
 
-_received: list[int] = []  # signals that were not obeyed yet
+_received: list[int] = []  # signals since the last `obeying` began
 
 
 class Interrupted(KeyboardInterrupt):
@@ -29,17 +29,17 @@ class Interrupted(KeyboardInterrupt):
 
 
 def check() -> None:
-    """Raise `Interrupted` if a signal came whose exception got lost."""
+    """Raise `Interrupted` if a signal arrived and its exception was lost."""
     if _received:
         raise Interrupted(_received[0])
 
 
 @contextlib.contextmanager
 def obeying(message: str) -> Iterator[None]:
-    """Turn signals into `Interrupted` inside of the block; print a message if the process has to be ended at once.
+    """Raise `Interrupted` for signals inside the block; print a message if the process has to be ended at once.
 
-    Signals that the process ignores, as under `nohup`, stay ignored. In another thread than the main one this does
-    nothing, since Python handles no signals there.
+    Signals that the process ignores, as under `nohup`, stay ignored. Outside the main thread this does nothing, since
+    Python handles no signals there.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -67,9 +67,9 @@ def obeying(message: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def counting() -> Iterator[Callable[[], int]]:
-    """Count signals instead of ending the command, which has to come to an end in order; yield their number so far.
+    """Count signals instead of ending the command, for code that must finish; yield a function that returns the count.
 
-    For code inside of `obeying`, in the main thread. Signals that the process ignores stay ignored.
+    For code inside `obeying`, in the main thread. Signals that the process ignores stay ignored.
     """
     received: list[int] = []
     numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
@@ -91,7 +91,7 @@ def _interrupt(number: int, _: object) -> None:
 
 
 def _end_at_last(reader: socket.socket, finished: threading.Event, numbers: list[int], message: str) -> None:
-    """Wait for one of some signals, then for the end of the block; end the process if that does not come."""
+    """Wait for one of the signals, then for the end of the block; end the process if the block does not end in time."""
     with reader:
         while received := reader.recv(1):
             if received[0] in numbers:

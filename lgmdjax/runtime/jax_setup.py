@@ -1,6 +1,6 @@
-"""Environment variables that JAX and others read when they are imported.
+"""Environment variables that JAX and other libraries read when they are imported.
 
-This module does not import them, so that a program can call `prepare_jax` first.
+This module imports none of these libraries, so that a program can call `prepare_jax` first.
 """
 
 import ctypes.util
@@ -16,7 +16,7 @@ except ImportError:  # Windows
 from lgmdjax.errors import InputError, one_line
 
 PREFIXES = ("JAX_", "XLA_", "CUDA_", "TF_CPP_", "MUJOCO_", "MPL", "PYOPENGL_")
-"""Of the variables that decide how libraries start."""
+"""Prefixes of the environment variables that affect how libraries start."""
 MIN_MEMORY = 2e9  # bytes of address space; with less, XLA ends the process when it starts its threads
 COUNT = "JAX_NUM_CPU_DEVICES"
 
@@ -24,8 +24,8 @@ COUNT = "JAX_NUM_CPU_DEVICES"
 def prepare_jax() -> None:
     """Set the environment variables of JAX that the user has not set.
 
-    Compiled programs, the many small ones too, are cached in ~/.cache/lgmdjax/jax, or not at all for a user without a
-    home folder. Each CPU core becomes a device, over which robots are sharded, and XLA logs less.
+    Compiled programs, including the many small ones, are cached in ~/.cache/lgmdjax/jax; without a home folder they are
+    not cached. Each CPU core becomes a device, over which robots are sharded, and XLA logs less.
     """
     if home := _cache_home():
         _set_default("JAX_COMPILATION_CACHE_DIR", str(home / "lgmdjax" / "jax"))
@@ -37,10 +37,10 @@ def prepare_jax() -> None:
 
 
 def prepare_opengl() -> None:
-    """Set the variables by which MuJoCo finds OpenGL without a window, before MuJoCo is imported.
+    """Set the variables with which MuJoCo renders without a window; call this before MuJoCo is imported.
 
-    On Linux without a screen that is EGL, or OSMesa where there is no EGL. Mesa's software renderer gets no threads,
-    which for pictures of a hundred pixels cost five times what they save.
+    On Linux without a screen MuJoCo uses EGL, or OSMesa if there is no EGL. Mesa's software renderer gets no threads,
+    which for pictures of a hundred pixels cost five times the time that they save.
     """
     _set_default("LP_NUM_THREADS", "0")
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -48,7 +48,7 @@ def prepare_opengl() -> None:
 
 
 def check_variables() -> None:
-    """Raise `InputError` for a variable or a limit of memory that JAX would stop at without naming it."""
+    """Raise `InputError` for a variable or a memory limit with which JAX would fail without naming it."""
     count = os.environ.get(COUNT, "1")
     if not (count.isascii() and count.isdigit() and 0 < int(count) <= 1024):
         raise InputError(f"expected {COUNT} of 1 to 1024, got {count!r}; unset it for one device on each core")
@@ -59,7 +59,7 @@ def check_variables() -> None:
 
 
 def user_variables() -> str:
-    """Return the variables that the user has set, and that decide how libraries start, as one text; it may be empty."""
+    """Return the variables that the user has set and that affect how libraries start, in one line; it may be empty."""
     names = sorted(name for name in os.environ if name.startswith(PREFIXES) and os.environ[name] != _DEFAULTS.get(name))
     return one_line(", ".join(f"{name}={os.environ[name]!r}" for name in names))
 
@@ -75,5 +75,5 @@ def _set_default(name: str, value: str) -> None:
 def _cache_home() -> Path | None:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    except RuntimeError:  # neither HOME nor an entry in the list of users
+    except RuntimeError:  # neither HOME nor an entry in the user database
         return None

@@ -1,4 +1,4 @@
-"""MJX, imported without the two lines that it prints where its optional back end (Warp) is not installed."""
+"""MJX, imported without the two lines that it prints if its optional back end (Warp) is not installed."""
 
 import contextlib
 import io

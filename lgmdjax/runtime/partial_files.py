@@ -1,7 +1,7 @@
-"""Files and folders that appear whole or not at all, whatever ends the process that writes them.
+"""Atomic writes: files and folders appear whole or not at all, even if the process that writes them is killed.
 
-A file is written under a temporary name, and gets its own when its content is on the disk, so that not even a power cut
-leaves half a file under a final name. What processes leave behind that are killed is removed by the next one.
+A file is written under a temporary name and renamed when its content is on the disk, so that not even a power cut
+leaves half a file under its final name. The temporary files of killed processes are removed by the next process.
 """
 
 import contextlib
@@ -38,10 +38,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_all(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder; at the end of the block its files move into `folder`, which is made if need be.
+    """Yield a temporary folder; at the end of the block its files move into `folder`, which is created if missing.
 
-    A block that raises leaves `folder` as it was. What processes left there that were killed inside of the block is
-    removed; what belongs to a living one is not.
+    A block that raises leaves `folder` as it was. Temporary folders that killed processes left there are removed; those
+    of running processes are not.
     """
     with _working_folder(folder, remove_empty=True) as work:
         yield work
@@ -52,17 +52,17 @@ def replacing_all(folder: Path) -> Iterator[Path]:
 
 
 def require_empty(folder: Path) -> None:
-    """Raise `InputError` unless a folder is empty or missing, so that nothing of the user's is replaced."""
+    """Raise `InputError` unless a folder is empty or missing, so that no file of the user is replaced."""
     if folder.is_dir() and not any(folder.iterdir()):
         return
     if folder.exists() or folder.is_symlink():
-        content = "has files" if folder.is_dir() else "is no folder"
+        content = "has files" if folder.is_dir() else "is not a folder"
         raise InputError(f"expected an empty or a new folder, got {folder}, which {content}; choose another")
 
 
 @contextlib.contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `folder`; at the end of the block it becomes `folder`, with all of its files.
+    """Yield a temporary folder next to `folder`; at the end of the block it becomes `folder`, with all of its files.
 
     A block that raises leaves nothing. Raises `InputError` for a folder that has files or cannot be made.
     """
@@ -80,9 +80,9 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _working_folder(parent: Path, *, remove_empty: bool = False) -> Iterator[Path]:
-    """Yield a locked temporary folder in `parent`, which is made if need be; remove it, and those of killed processes.
+    """Yield a locked temporary folder in `parent`, which is created if missing; remove it at the end.
 
-    Raises `InputError` if none can be made.
+    Temporary folders of killed processes are removed too. Raises `InputError` if no folder can be made.
 
     Args:
         parent: where the folder is made.
@@ -92,7 +92,7 @@ def _working_folder(parent: Path, *, remove_empty: bool = False) -> Iterator[Pat
         parent.mkdir(parents=True, exist_ok=True)
         _remove_abandoned_folders(parent)
         work = parent / f"{checksums.PARTIAL}-{secrets.token_hex(8)}"
-        lock = FileLock(_lock_of(work)).acquire()  # before there is a folder, so that one without a lock is abandoned
+        lock = FileLock(_lock_of(work)).acquire()  # before the folder: a folder without a lock is abandoned
     except OSError as error:
         raise not_writable(parent, error) from error
     try:
@@ -108,7 +108,7 @@ def _working_folder(parent: Path, *, remove_empty: bool = False) -> Iterator[Pat
 
 
 def remove_partial_files(folder: Path) -> None:
-    """Remove what killed processes left of unfinished files in a folder and in those below it.
+    """Remove the unfinished files that killed processes left in a folder and below.
 
     Only the process that holds the lock of the folder may call this.
     """
@@ -121,14 +121,14 @@ def remove_partial_files(folder: Path) -> None:
 def sync(path: Path) -> None:
     """Wait until the content of a file, or the names in a folder, are on the disk."""
     if path.is_dir():
-        with contextlib.suppress(OSError):  # Windows opens no folders; some network disks sync none
+        with contextlib.suppress(OSError):  # Windows cannot open folders; some network disks cannot sync them
             descriptor = os.open(path, os.O_RDONLY)
             try:
                 os.fsync(descriptor)
             finally:
                 os.close(descriptor)
     else:
-        with path.open("rb+") as file:  # for writing, as Windows wants it
+        with path.open("rb+") as file:  # for writing, as Windows requires
             os.fsync(file.fileno())
 
 

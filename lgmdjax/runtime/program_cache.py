@@ -1,9 +1,9 @@
 """Checksums for JAX's own cache of compiled programs.
 
-JAX compresses what it caches, and believes what it can decompress: damaged machine code crashes or computes something
-else. `protect` appends to each entry a mark and the SHA-256 of what stands before it. A damaged entry is deleted, and
-the program is compiled again. JAX without this module reads such entries as well: it stops at the end of the compressed
-data. Entries without a mark are from JAX alone, and are read; if JAX cannot, they are replaced.
+JAX compresses what it caches, and accepts whatever it can decompress: damaged machine code crashes or gives wrong
+results. `protect` appends to each entry a mark and the SHA-256 of what precedes it. A damaged entry is deleted, and the
+program is compiled again. JAX without this module reads such entries as well: it stops at the end of the compressed
+data. Entries without a mark were written without this module. They are read, or replaced if JAX cannot read them.
 
 Source: the interface of `jax._src.compilation_cache` (JAX 0.9 to 0.12), which is private. Where it has changed, JAX's
 cache is used as it is.
@@ -28,12 +28,12 @@ class CheckedCache:
     """A cache of JAX, with a checksum at the end of each entry.
 
     Args:
-        cache: of JAX, in a folder.
+        cache: JAX's cache of a folder.
     """
 
     def __init__(self, cache: Any):
         self.cache, self.path = cache, cache.path
-        self._path = self.path  # the name of JAX's interface
+        self._path = self.path  # its name in JAX's interface
 
     def get(self, key: str) -> bytes | None:
         """Return an entry without its checksum; None if there is none, or a damaged one, which is deleted."""
@@ -71,7 +71,7 @@ def protect() -> None:
 
 
 class _MakeChecked:
-    """JAX's function that makes its cache, but with checksums."""
+    """JAX's function that makes its cache, with checksums added."""
 
     def __init__(self, make: Callable[[str], tuple[Any, str] | None]):
         self.make = make

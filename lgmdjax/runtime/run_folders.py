@@ -9,11 +9,11 @@
 | runs/<name>/.lock                          | locked by the process that runs stages                           |
 
 A stage's fingerprint covers its settings, the seed, the versions of its format and of lgmdjax, and the fingerprints of
-its inputs. A stage whose folder carries the fingerprint that it would get now, and whose files have the checksums that
-they had when it finished, is up to date. run.json and done.json have a checksum of their own.
+its inputs. A stage is up to date if its folder has the fingerprint that the stage would get now, and its files have the
+checksums that they had when it finished. run.json and done.json have a checksum of their own.
 
-Folders of format 1 (version 0.1.0) named some settings otherwise. Their robots can be loaded; their stages cannot be
-resumed.
+Folders of format 1 (version 0.1.0) have other names for some settings. Their robots can be loaded; their stages cannot
+be resumed.
 """
 
 import contextlib
@@ -168,7 +168,7 @@ def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
 
 
 def _adopt_stamp(folder: Path) -> None:
-    """Give a done.json its name that a process wrote to its end, but was killed before it could name it."""
+    """Rename a complete done.json whose process was killed before it could rename it."""
     for written in folder.glob(f"{checksums.STAMP}.*{checksums.PARTIAL}"):
         with contextlib.suppress(OSError, ValueError, RecursionError):
             if checksums.is_sealed(json.loads(written.read_bytes())):
@@ -197,7 +197,7 @@ def _print_start(stage: Stage, final: Path, seed: int, *, resumed: bool) -> None
 
 
 def _find_fault(folder: Path, stage_fingerprint: str) -> str | None:
-    """Return None if a folder has a finished stage of this fingerprint, else what is wrong; "" if nothing was there."""
+    """Return None if a folder has a finished stage of this fingerprint, else what is wrong; "" without a folder."""
     if not (folder / checksums.STAMP).exists():
         return f"{folder} has no {checksums.STAMP}" if folder.exists() else ""
     try:
@@ -213,7 +213,7 @@ def _find_fault(folder: Path, stage_fingerprint: str) -> str | None:
 
 
 def _file_sizes(folder: Path) -> dict[str, int]:
-    """Return the sizes of all files, which done.json listed before it had checksums."""
+    """Return the sizes of all files, which done.json of older versions lists in place of checksums."""
     return {str(path.relative_to(folder)): path.stat().st_size for path in folder.rglob("*") if path.is_file()}
 
 
@@ -223,7 +223,7 @@ def _required_stages(stages: Mapping[str, Stage], target: str) -> set[str]:
 
 
 def _to_json(settings: object) -> object:
-    """Convert nested dataclasses to what reading them back from JSON gives."""
+    """Convert nested dataclasses to the values that they have when read back from JSON."""
     if dataclasses.is_dataclass(settings) and not isinstance(settings, type):
         settings = dataclasses.asdict(settings)
     if isinstance(settings, Mapping):
@@ -233,9 +233,9 @@ def _to_json(settings: object) -> object:
 
 SEED = schema.Integer(0, SEED_LIMIT - 1)
 RUN_FACTS = schema.Object({"format": schema.Integer(1, 1000), "settings": schema.Object()}, {"seed": SEED})
-"""What run.json holds in every format."""
+"""Schema of run.json in every format."""
 PRESENT_FACTS = schema.Object({"scale": schema.Text(), "seed": SEED, "versions": schema.Object()})
-"""What it holds besides in the present format."""
+"""Schema of its further fields in the present format."""
 
 
 def read_facts(folder: Path) -> JsonObject:

@@ -1,11 +1,11 @@
-"""What a file may contain, written down where it is read: types, shapes and ranges.
+"""Schemas of file contents: types, shapes and ranges of the values that are read.
 
 ```python
 CAMERA = Object({"width": Integer(1, 4096), "overlap": Number(0.5, 1.0)})
 check(CAMERA, header["eyes"], f"{path}: eyes", "train again")
 ```
 
-Numbers are finite, and neither text nor truth values. Objects may have further fields, which newer versions write.
+Numbers are finite; text and booleans are not numbers. Objects may have further fields, which newer versions write.
 """
 
 import sys
@@ -57,21 +57,21 @@ class Flag:
         return "true or false"
 
     def accepts(self, value: object) -> bool:
-        """Tell whether a value is a truth value."""
+        """Tell whether a value is a boolean."""
         return isinstance(value, bool)
 
 
 @dataclass(frozen=True)
 class Text:
-    """A text, one of some choices if there are any."""
+    """Text; one of `choices` if there are any."""
 
     choices: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return f"one of {', '.join(self.choices)}" if self.choices else "a text"
+        return f"one of {', '.join(self.choices)}" if self.choices else "text"
 
     def accepts(self, value: object) -> bool:
-        """Tell whether a value is such a text."""
+        """Tell whether a value is such text."""
         return isinstance(value, str) and (not self.choices or value in self.choices)
 
 
@@ -104,7 +104,7 @@ class Object:
         return f"an object with {', '.join(self.fields)}" if self.fields else "an object"
 
     def accepts(self, value: object) -> bool:
-        """Tell whether a value has all required fields; `check` looks into them."""
+        """Tell whether a value has all required fields; `check` checks their values."""
         return isinstance(value, Mapping) and self.fields.keys() <= value.keys()
 
 
@@ -121,10 +121,10 @@ def check(expected: Schema, value: object, place: str, remedy: str) -> None:
     lgmdjax.errors.InputError: eyes.width: expected an integer of 1 to 4096, got True; train again
 
     Args:
-        expected: of the value.
+        expected: schema of the value.
         value: from a file.
         place: where the value is, for the message.
-        remedy: what to do about another value, for the message.
+        remedy: what to do about a wrong value, for the message.
     """
     if not expected.accepts(value):
         raise InputError(f"{place}: expected {expected}, got {_describe(value)}; {remedy}")

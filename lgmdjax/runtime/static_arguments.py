@@ -1,4 +1,4 @@
-"""What stands for the static arguments of a compiled program in its key on disk (`lgmdjax.runtime.export_cache`)."""
+"""Static arguments of a compiled program as a part of its key on disk (`lgmdjax.runtime.export_cache`)."""
 
 import dataclasses
 import inspect
@@ -8,9 +8,9 @@ PACKAGE = __name__.partition(".")[0]
 
 
 def describe(static: object) -> object:
-    """Return values whose text is the same in every process, and another for other arguments.
+    """Return values whose `repr` is the same in every process and differs between different arguments.
 
-    A function stands for itself by its place in the source of this package, every byte of which is part of the key too.
+    A function is described by its position in the source of this package, every byte of which is part of the key too.
 
     Args:
         static: a plain value, a dataclass, a function, or a tuple, list or mapping of these.

@@ -7,7 +7,7 @@
 | safetensors              | `save_tensors`                   | `load_tensors`              |
 | any other                | `lgmdjax.runtime.partial_files`  | `read_file`                 |
 
-What is read is compared with its checksum, where it has one (`lgmdjax.runtime.checksums`). A file is written under a
+A file that has a checksum is compared with it when it is read (`lgmdjax.runtime.checksums`). A file is written under a
 temporary name first (`lgmdjax.runtime.partial_files`).
 """
 
@@ -73,7 +73,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_table(path: Path) -> Any:
-    """Read a JSON file of numbers of a run folder, in which null is an unknown number, nan."""
+    """Read a JSON file of numbers of a run folder; null, an unknown number, becomes nan."""
     return _null_as_nan(read_json(path))
 
 
@@ -109,7 +109,7 @@ def _null_as_nan(content: object) -> object:
 
 
 def _require_sizes(content: bytes) -> None:
-    """Raise `ValueError` unless all arrays of an npz file are as large as they say, before memory is asked for."""
+    """Raise `ValueError` unless each array of an npz file has its declared size; no memory is allocated for it yet."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for member in archive.infolist():
             with archive.open(member) as file:
@@ -121,12 +121,12 @@ def _require_sizes(content: bytes) -> None:
                 stated = math.prod(shape) * dtype.itemsize
                 has_that_size = file.tell() + stated == member.file_size <= len(content)
                 if min(shape, default=0) < 0 or not has_that_size:
-                    raise ValueError(f"{member.filename} says that it has {stated} bytes")
+                    raise ValueError(f"{member.filename} declares {stated} bytes, but has another size")
 
 
 @contextlib.contextmanager
 def _naming_command(path: Path) -> Iterator[None]:
-    """Turn an error of reading into one that names the file, and the command that makes it."""
+    """Replace an error of reading by one that names the file and the command that writes it."""
     folder = path.parent.name.partition(".")[0]
     is_shipped = path.is_relative_to(PACKAGE_DIR)
     command = folder if path.name != "run.json" and folder in STAGE_COMMANDS else "reproduce"
@@ -202,7 +202,7 @@ def load_tensors(path: Path | str, kind: TensorFile) -> tuple[dict[str, np.ndarr
 
 
 def _digest_tensors(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:
-    """Return the checksum of arrays and of a header, but for the header's own checksum."""
+    """Return the checksum of arrays and of a header, except the header's own checksum."""
     arrays = [(name, str(array.dtype), array.shape, array.tobytes()) for name, array in sorted(tensors.items())]
     rest = sorted((name, text) for name, text in header.items() if name != checksums.SEAL)
     return checksums.digest(repr((rest, arrays)).encode())

@@ -1,4 +1,4 @@
-"""Curves of fits while they run: every fit calls `log(step, values)`, and whoever listens gets them.
+"""Curves of fits while they run: every fit calls `log(step, values)`, which passes the values to all listeners.
 
 >>> seen = []
 >>> with listening(lambda step, values: seen.append((step, dict(values)))):
@@ -7,8 +7,8 @@
 >>> seen
 [(100, {'fit/loss': 0.5})]
 
-A value's name is that of the fit, a slash, and that of the quantity with its unit. `lgmdjax train --track` listens with
-TensorBoard or with a function of the user's (`lgmdjax.cli.tracking`).
+A value's name is that of the fit, a slash, and that of the quantity with its unit. `lgmdjax train --track` adds as a
+listener TensorBoard or a function of the user (`lgmdjax.cli.tracking`).
 """
 
 import contextlib
@@ -24,7 +24,7 @@ _listeners: ContextVar[tuple[Log, ...]] = ContextVar("listeners", default=())
 
 @contextlib.contextmanager
 def listening(to: Log) -> Iterator[None]:
-    """Pass what fits log inside of the block to `to`, beside those that listen already."""
+    """Pass what fits log inside the block to `to`, in addition to earlier listeners."""
     token = _listeners.set((*_listeners.get(), to))
     try:
         yield
@@ -33,12 +33,12 @@ def listening(to: Log) -> Iterator[None]:
 
 
 def is_listening() -> bool:
-    """Return whether anybody listens; a fit need not fetch values from its device if nobody does."""
+    """Return whether there is a listener; without one, a fit need not fetch values from its device."""
     return bool(_listeners.get())
 
 
 def log(step: int, values: Mapping[str, float]) -> None:
-    """Pass values of one step of a fit to all that listen."""
+    """Pass values of one step of a fit to all listeners."""
     for listener in _listeners.get():
         listener(step, values)
 

@@ -24,7 +24,7 @@ REPLAY_LENGTH = 4096  # velocities of policy random; static, so that one compile
 LGMD = schema.Object(
     {
         "threshold": schema.Number(0, 255),  # grey
-        "suppression": schema.Number(0, 2 * 255),  # grey; twice the largest FF is as good as none
+        "suppression": schema.Number(0, 2 * 255),  # grey; twice the largest FF, which never suppresses
         "inhibition": schema.Number(0, 100),
     }
 )
@@ -32,11 +32,11 @@ SIDE = schema.Integer(1, camera.MAX_SIZE)  # px
 FIELD = {name: schema.Number(*limits) for name, limits in FIELD_LIMITS.items()}
 EYES = schema.Object({"width": SIDE, "height": SIDE}, {**FIELD, "pooling": SIDE})
 HEADER = schema.Object({"eyes": EYES, "lgmd": LGMD})
-"""What the header of a controller holds besides the network's structure."""
+"""Schema of the header of a controller, without the network's structure."""
 BASELINES = schema.Object(
     {"gain": schema.Numbers((), -1e9, 1e9), "replayed": schema.Numbers((REPLAY_LENGTH, 2), -10, 10)}
 )
-"""What baselines.npz holds: the gain of policy direct [1/m], and velocities [nominal] of policy random."""
+"""Schema of baselines.npz: the gain of policy direct [1/m], and velocities [nominal] of policy random."""
 
 
 def camera_params(settings: CameraSettings) -> camera.Params:
@@ -46,7 +46,7 @@ def camera_params(settings: CameraSettings) -> camera.Params:
 
 
 def camera_settings(robot: closed_loop.Params) -> CameraSettings:
-    """Return the settings that `with_camera` gave a robot."""
+    """Return the camera settings of a robot, as `with_camera` sets them."""
     of_camera = {name: getattr(robot.camera, name) for name in ("width", "height", "overlap", "ground")}
     return CameraSettings(**of_camera, pooling=robot.controller.lgmd.pooling, falloff=robot.controller.lgmd.falloff)
 
@@ -59,7 +59,7 @@ def read_camera_settings(header: JsonObject) -> CameraSettings:
 
 
 def fit_detector(detector: lgmd.Params, settings: CameraSettings) -> lgmd.Params:
-    """Return the LGMD with cells of the size, the bearings and the weights that the camera's settings give."""
+    """Return the LGMD with the size, the bearings and the weights of its cells set for a camera."""
     edges = hemifield.edges(camera.Params().fov, settings.overlap)
     return replace(detector, pooling=settings.pooling, falloff=settings.falloff, edges=edges)
 
@@ -109,7 +109,7 @@ def make_policies(
     direct_gain: float = 0.0,
     replay_velocities: np.ndarray | None = None,
 ) -> policies.PolicySwitch:
-    """Return all five policies, the teacher active; what is not given yet gets a placeholder.
+    """Return all five policies, with the teacher active; arguments that are not given get placeholders.
 
     Args:
         navigator_params: the trained navigator; untrained if None.
@@ -144,7 +144,7 @@ def with_camera(params: closed_loop.Params, settings: CameraSettings) -> closed_
 
 
 def with_resolution(robot: closed_loop.Params, resolution: Resolution) -> closed_loop.Params:
-    """Return the robot with images and LGMD cells of another size; what its LGMDs see stays as it was trained."""
+    """Return the robot with images and LGMD cells of another size; its LGMDs keep their field of view and weights."""
     sizes = {name: getattr(resolution, name) for name in ("width", "height", "pooling")}
     return with_camera(robot, replace(camera_settings(robot), **sizes))
 
@@ -157,7 +157,7 @@ def scale_resolution(robot: closed_loop.Params, width: int) -> Resolution:
     camera, pooling = robot.camera, robot.controller.lgmd.pooling
     if width < 1 or (pooling * width) % camera.width or (camera.height * width) % camera.width:
         raise InputError(
-            f"expected a --width whose cells are whole pixels as the {pooling} of {camera.width} are, got {width}; "
+            f"expected a --width whose cells are whole pixels ({pooling} at width {camera.width}), got {width}; "
             f"try {2 * camera.width}"
         )
     height, cell = camera.height * width // camera.width, pooling * width // camera.width

@@ -39,7 +39,7 @@ Tree = TypeVar("Tree")
 AnyArray = Array | np.ndarray
 
 GradPath = Literal["controller", "body", "everything"]
-"""What a gradient passes through: the policy alone, also the body and the label, or also the camera and the LGMDs."""
+"""What a gradient passes through: only the policy; also the body and the label; or also the camera and the LGMDs."""
 
 FRAME_RATE = 30.0  # Hz, of the camera (paper sec. 3.1)
 PATH_STRIDE = 8  # frames between two points of a path that a notebook shows
@@ -48,7 +48,7 @@ SUBSTEPS = 6  # physics steps a frame; the time step in the robot's XML is 1 / (
 
 @struct.dataclass(kw_only=True)
 class Params(Shown):
-    """Parameters of a robot, beside its body: controller, teacher, and sensors."""
+    """Parameters of a robot, except its body: controller, teacher, and sensors."""
 
     controller: controller.Params
     teacher: braitenberg.Params  # of the rule that labels the frames
@@ -87,7 +87,7 @@ class State:
 
 @struct.dataclass(kw_only=True)
 class Record(Shown):
-    """What is recorded of one frame, or of many: `axes` are then (frame) or (robot, frame).
+    """The record of one frame, or of many: `axes` are then (frame) or (robot, frame).
 
     The pose is that from which the pictures were rendered. Records on the host hold NumPy arrays.
     """
@@ -134,8 +134,8 @@ def assemble(
 ) -> Params:
     """Assemble a robot from the parameters of its policy and of all components that are not the default.
 
-    Plain numbers become arrays, so that one compiled program serves all values and can be differentiated by them. The
-    default shaping networks are those of the package (`shaping.load_pretrained`).
+    Plain numbers become arrays, so that one compiled program serves all values and can be differentiated with respect
+    to them. The default shaping networks are those of the package (`shaping.load_pretrained`).
 
     Raises InputError for invalid numbers (`check` of the components), unless some are traced.
     """
@@ -218,7 +218,7 @@ def _hold_vision(state: State, observation: Observation) -> tuple[State, Observa
 
 
 def reset(params: Params, room: Room, state: State, policy: Policy) -> State:
-    """Reset a robot that had contact to the room's next start, with new policy and teacher states; the CPG goes on."""
+    """Reset a robot after contact to the room's next start, with new policy and teacher states; the CPG continues."""
     resets = state.resets + 1
     start = jnp.take(room.starts, resets, axis=0, mode="wrap")
     policy_state = policy.init(params.controller.policy, jax.random.fold_in(room.key, resets))
@@ -253,7 +253,7 @@ def sense(
 def respond(
     params: Params, state: State, frames: Float[Array, "2 height columns"], ranges: Float[Array, " rays"]
 ) -> tuple[State, Observation]:
-    """Step the LGMDs (eqs. 7-16) by what `sense` returned; return the observation."""
+    """Step the LGMDs (eqs. 7-16) with what `sense` returned; return the observation."""
     detected = controller.detect_or_start(params.controller, state.controller, frames, state.is_first)
     controller_state, response = detected
     if params.frame_stride is not None:
@@ -275,7 +275,7 @@ def render_stereo(
 ) -> Float[Array, "2 height columns"]:
     """Render both cameras from a pose of the trunk, in grey levels 0..255; black without `render`.
 
-    Whether to render is decided at run time even where it is known before, so that rendering is compiled separately.
+    Whether to render is decided at run time even if it is known before, so that rendering is compiled separately.
     Otherwise XLA would render again inside each loop that reads the picture, with other rounding in each program. If
     `render` is an array, one compiled program serves rollouts with and without pictures.
     """
@@ -300,7 +300,7 @@ def move(
 ) -> tuple[State, Float[Array, ""]]:
     """Run CPG, servos and physics until the next frame; return also the smallest clearance [m] within it.
 
-    With `targets` [rad] the servos hold these set points for the whole frame, and the CPG stands still.
+    With `targets` [rad] the servos hold these set points for the whole frame, and the CPG is not stepped.
     """
     model = hexapod.place_barriers(model, scene, state.data)
     interval = 1 / (FRAME_RATE * SUBSTEPS)
@@ -353,7 +353,7 @@ def _record(state: State, observation: Observation, label: Float[Array, "2"], cl
 
 
 def freeze_unhealthy(before: State, after: State) -> State:
-    """Freeze a robot for good, in its last healthy state, if it fell or became non-finite; the frame count goes on."""
+    """Freeze a robot permanently in its last healthy state if it fell or became non-finite; it still counts frames."""
     ok = before.ok & hexapod.is_healthy(after.data)
     return replace(_where(ok, after, before), ok=ok, frame=after.frame)
 

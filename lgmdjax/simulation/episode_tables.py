@@ -1,4 +1,4 @@
-"""Tables of recorded walks: their columns, and what may be in them (`lgmdjax.simulation.episodes`)."""
+"""Tables of recorded walks: their columns, and the values that are allowed (`lgmdjax.simulation.episodes`)."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -132,7 +132,7 @@ def check(table: pa.Table, path: Path) -> pa.Table:
 
 
 def digest(table: pa.Table, header: JsonObject) -> str:
-    """Return the checksum of a table and of its header, but for the header's own checksum."""
+    """Return the checksum of a table and of its header, except the header's own checksum."""
     rest = {name: value for name, value in header.items() if name != checksums.SEAL}
     columns = [(name, str(table[name].type), table[name].to_numpy().tobytes()) for name in table.column_names]
     return checksums.digest(repr((json.dumps(rest, sort_keys=True), columns)).encode())
@@ -161,7 +161,7 @@ def _checked_arrays(record: Record) -> dict[str, np.ndarray]:
 
 
 def _with_finite_numbers(table: pa.Table, path: Path) -> pa.Table:
-    """Return a table without nan; raise `InputError` for one in a frame that is ok. Older files have some in others."""
+    """Return a table without nan; raise `InputError` for nan in a frame that is ok. Older files have it in others."""
     ok = table["ok"].to_numpy()
     for name, kind in KINDS.items():
         values = table[name].to_numpy()

@@ -19,8 +19,8 @@ A walk is the recorded trajectory of one robot in one room.
 Pictures are not stored: `lgmdjax.simulation.rerender` renders them again from the poses. A walk is written in chunks.
 Each chunk is a file that gets its name when it is complete, so that an interruption loses only the present chunk.
 Numbers keep their precision. The header has a checksum of the columns and of itself; files of earlier versions have
-none. What is not as the table says is refused: other types, missing or infinite numbers in frames that are ok, time
-that does not increase, a walk in two rooms.
+none. A file is refused if it has other columns or types, missing or infinite numbers in frames that are ok, time that
+does not increase, or a walk in two rooms.
 
 Version 1 called the columns `is_first` and `resets` "fresh" and "setbacks"; versions 1 and 2 lack `corridor_*`, for
 which `distance_*` is read. Both can still be read.
@@ -51,7 +51,7 @@ from lgmdjax.simulation.episode_tables import ORIGIN
 
 FORMAT, VERSION = "lgmdjax episodes", 3
 RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, 2: {}, VERSION: {}}
-"""Versions that can be read, and their other names of columns."""
+"""Versions that can be read, each with its former names of columns and their present names."""
 NEAREST_ONLY = (1, 2)
 """Versions without distances along the corridor: their teacher reacted to the nearest distances."""
 
@@ -59,7 +59,7 @@ HEADER = schema.Object(
     {"format": schema.Text((FORMAT,)), "parameters": schema.Object()},
     {checksums.SEAL: schema.Text(), "units": schema.Object(), "versions": schema.Object()},
 )
-"""What the header of a chunk holds, beside its version."""
+"""Schema of the header of a chunk, without its version."""
 
 
 @struct.dataclass(kw_only=True)
@@ -203,7 +203,7 @@ def _runs(changes: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _walk(folder: Path | str, columns: Mapping[str, np.ndarray]) -> Walk:
-    """Return the walk of some rows; raise `InputError` unless its frames follow each other, in one room."""
+    """Return the walk of some rows; raise `InputError` unless time increases and the room is the same."""
     episode, robot, room, seed = (int(columns[name][0]) for name in ORIGIN)
     backward, time = np.flatnonzero(~(np.diff(columns["time"]) > 0)), columns["time"]
     if len(backward) or np.ptp(columns["room"]) or np.ptp(columns["seed"]):
@@ -248,7 +248,7 @@ def _load(path: Path) -> tuple[JsonObject, pa.Table]:
         content = pa.BufferReader(checksums.read_bytes(path))
         with pq.ParquetFile(content, page_checksum_verification=True) as file:
             header = _check_header(path, file.schema_arrow.metadata or {})
-            if file.metadata.num_rows > episode_tables.MAX_ROWS:  # before memory is asked for
+            if file.metadata.num_rows > episode_tables.MAX_ROWS:  # before memory is allocated
                 raise checksums.ChecksumError(f"{file.metadata.num_rows} rows")
             table = file.read()
         if header.get(checksums.SEAL) not in (None, episode_tables.digest(table, header)):

@@ -1,8 +1,8 @@
-"""Frames of records whose numbers are not finite: flagged as not ok, and refused where they are flagged as ok.
+"""Non-finite numbers in records: a frame with such a number is flagged as not ok, or refused if flagged as ok.
 
-A rollout goes on when a robot's state, its room or a texture is not finite: nothing raises in compiled code. On the
-host every field of every frame is looked at. In a frame that is not ok, numbers that are not finite become zero, so
-that no sum over many frames becomes nan.
+A rollout continues when a robot's state, its room or a texture is not finite, since compiled code cannot raise. On the
+host every field of every frame is checked. In a frame that is not ok, numbers that are not finite become zero, so that
+no sum over many frames becomes nan.
 """
 
 from dataclasses import fields, replace

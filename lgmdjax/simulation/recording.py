@@ -51,7 +51,7 @@ def rollout(
         rooms: a batch of rooms, as `room_batches.random_rooms` returns it.
         seconds: of robot time.
         policy: name of the policy.
-        render: whether to render the cameras; if None, only for policies that use them. Else u is 0.5.
+        render: whether to render the cameras; if None, only for policies that use them. Without pictures u is 0.5.
     """
     chosen = policies.get_policy(policy)
     batches = rollout_in_batches(
@@ -102,8 +102,8 @@ def rollout_in_batches(
 ) -> Iterator[tuple[list[int], closed_loop.Record]]:
     """Roll out any number of robots in batches of one of `BATCH_SIZES`, yielding indices of robots and their record.
 
-    Batches of one size share one compiled program: the last one is padded with its last robot, which is cut from the
-    record. The first `skip_batches` are left out.
+    All batches have one size and share one compiled program: the last batch is padded with copies of its last robot,
+    which are cut from the record. The first `skip_batches` are left out.
     """
     robots = rooms.starts.shape[0]
     size = _batch_size(robots)
@@ -164,7 +164,7 @@ def is_recorded(folder: Path, robots: int) -> bool:
 
 
 def _batch_size(robots: int) -> int:
-    """Return the smallest size of a batch with a place for every robot, or the largest."""
+    """Return the smallest of `BATCH_SIZES` that holds all robots, or the largest."""
     return next((size for size in BATCH_SIZES if robots <= size), BATCH_SIZES[-1])
 
 

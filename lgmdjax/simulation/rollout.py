@@ -5,7 +5,7 @@
 | `rollout`        | `closed_loop.step` scanned over frames, for one robot                                     |
 | `rollout_batch`  | the same for a batch of robots, sharded over devices (`lgmdjax.simulation.sharding`)      |
 | `rollout_chunks` | that in chunks of a few seconds, so that the host can show progress, write, or stop       |
-| `scan_batch`     | any step of one robot, scanned and mapped, such as one that looks at recorded walks again |
+| `scan_batch`     | any step of one robot, scanned and mapped, such as one that renders recorded walks again  |
 
 On the command line and in notebooks use `lgmdjax.simulation.recording.rollout`.
 """
@@ -69,7 +69,7 @@ def rollout_batch(
 ) -> tuple[State, Record]:
     """Roll out a batch of robots, each in its own room; the record's axes are (robot, frame).
 
-    One program serves rollouts with and without pictures, and is kept on disk.
+    One program serves rollouts with and without pictures, and is cached on disk.
     """
 
     def step(room: Room, state: State, _: None) -> tuple[State, Record]:
@@ -116,8 +116,8 @@ def rollout_chunks(
 ) -> Iterator[Record]:
     """Roll out a batch of robots for `seconds`, yielding NumPy records of `chunk_seconds` one after the other.
 
-    One program is compiled for all chunks; the last one may run past the end and is cut. A frame that is not finite in
-    every field is not `ok`, and has zeros there (`lgmdjax.simulation.finite`).
+    One program is compiled for all chunks; the last one may run past the end and is cut. In a frame that is
+    not finite in every field, `ok` is false and such numbers are zero (`lgmdjax.simulation.finite`).
     """
     frames = max(1, round(chunk_seconds * closed_loop.FRAME_RATE))
     total = round(seconds * closed_loop.FRAME_RATE)

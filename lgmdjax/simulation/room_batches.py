@@ -20,8 +20,8 @@ from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.world import scenes
 from lgmdjax.world.arena import Arena, sample_free_poses
 
-START_COUNT = 32  # starts of a room's robot, one for each reset, used in order
-BENCHMARK_EPISODE = 2**23  # episode number of `benchmark_rooms`; training episodes never get so far
+START_COUNT = 32  # start poses of a room, used in order, a new one after each reset
+BENCHMARK_EPISODE = 2**23  # episode number of `benchmark_rooms`, above those of all training episodes
 CONTRAST_RANGE = (0.3, 1.0)  # factors by which the contrast of training rooms is scaled
 OVERHEAD_SHARE = 0.2  # of the obstacles in training rooms
 
@@ -49,7 +49,10 @@ def random_rooms(key: Array, count: int, density: Float[Array, ""] | float = 0.1
 
 @partial(jax.jit, static_argnames="count")
 def replicate_room(key: Array, arena: Arena, count: int, spread: Float[Array, ""] | float = jnp.pi) -> Room:
-    """Return a batch of rooms with the same arena: its own start, turned by up to `spread` [rad], then free starts."""
+    """Return a batch of rooms with the same arena.
+
+    The first start of each is the arena's own, rotated by up to `spread` [rad]; the others are random free poses.
+    """
 
     def room(key: Array) -> Room:
         turn_key, starts_key, policy_key = jax.random.split(key, 3)
@@ -61,16 +64,16 @@ def replicate_room(key: Array, arena: Arena, count: int, spread: Float[Array, ""
 
 
 def stack_rooms(rooms: list[Room]) -> Room:
-    """Stack single rooms with equally many prisms to a batch."""
+    """Stack single rooms with equally many prisms into a batch."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *rooms)
 
 
 def training_rooms(seed: int, episode: int, robots: int) -> Room:
     """Return the random rooms of a training episode, with contrasts in `CONTRAST_RANGE` and a few obstacles overhead.
 
-    Rooms of low contrast are needed: a navigator trained only in rooms of high contrast hardly turns from the one
-    moving edge in front of a plain wall, since little motion then means little danger. Obstacles overhead are needed
-    for table tops and crowns of trees: a navigator that never walked under anything turns round in front of them.
+    Rooms of low contrast are needed: a navigator trained only in rooms of high contrast learns that little motion means
+    no obstacle, and hardly turns from the single moving edge of a plain wall. Obstacles overhead are needed for table
+    tops and crowns of trees: a navigator that never walked under anything turns round in front of them.
     """
     key = jax.random.fold_in(jax.random.key(seed), episode)
     rooms = random_rooms(key, robots)

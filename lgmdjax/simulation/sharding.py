@@ -1,9 +1,9 @@
-"""Robots, and the streams of a fit, spread over the devices of this machine.
+"""Sharding of robots, and of the streams of a fit, over the devices of this computer.
 
-Robots are independent of each other, so they can run in parallel. A CPU core is a device if `JAX_NUM_CPU_DEVICES` says
-so before JAX starts, as the command line does. The cores cannot share one robot, whose physics is a long sequence of
-small sums. Streams of recorded walks are independent too, except that all share the weights, whose gradient is summed
-over the devices.
+Robots are independent of each other, so they can run in parallel. CPU cores become devices if `JAX_NUM_CPU_DEVICES` is
+set before JAX starts, as the command line does. One robot cannot be divided among cores, since its physics is a long
+sequence of small operations. Streams of recorded walks are independent too, except that all share the weights, whose
+gradient is summed over the devices.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 ResultT = TypeVar("ResultT")
 TreeT = TypeVar("TreeT")
 
-MIN_STREAMS = 8  # on one device; fewer take no less time than these
+MIN_STREAMS = 8  # on one device; fewer take as long as these
 
 
 def shard_robots(work: Callable[..., ResultT], *batches: PyTree) -> ResultT:
@@ -54,9 +54,9 @@ def shard_streams(work: Callable[..., ResultT], batches: PyTree, shared: tuple[P
     """Shard `work(batches, *shared)` over devices along the axis of streams; its result is the same on all of them.
 
     Args:
-        work: sums with `sum_over_devices` whatever depends on its streams alone.
+        work: a function that sums over devices, with `sum_over_devices`, whatever depends only on its own streams.
         batches: leaves with an axis of streams.
-        shared: further arguments, whole on every device.
+        shared: further arguments, replicated on every device.
         axis: of the streams in every leaf of `batches`.
     """
     streams = jax.tree.leaves(batches)[0].shape[axis]
@@ -74,7 +74,7 @@ def sum_over_devices(tree: TreeT) -> TreeT:
 
 
 def stream_device_count(streams: int) -> int:
-    """Return the number of devices for streams: the largest that gives each equally many, and enough of them."""
+    """Return the largest number of devices that gives each equally many streams, if possible `MIN_STREAMS` or more."""
     most = max(min(jax.local_device_count(), streams // MIN_STREAMS), 1)
     return max(count for count in range(1, most + 1) if streams % count == 0)
 

@@ -16,14 +16,14 @@ fitted to demonstrations of the teacher:
 | dagger + everything  | half of the DAgger rounds, then finetuned for half as long                                |
 | everything, n frames | finetuned through windows of n frames: the horizon                                        |
 
-All train for the same simulated time. Finetuned learners walk in as many rooms as there are rounds, with a learning
-rate proportional to their window, so that all can move equally far in a second. DAgger fits to all walks so far again
-and again; finetuning sees every window once. Finetuning uses smooth thresholds and the contacts of the XML. All
+All train for the same simulated time. Finetuned learners walk in as many rooms as there are rounds. Their learning rate
+is proportional to the window, so that parameters can change equally much per simulated second. DAgger fits to all walks
+so far in every round; finetuning uses every window once, with smooth thresholds and the contacts of the XML. All
 learners are then evaluated with hard thresholds, in held-out rooms.
 
 The turns are not rescaled (`behaviour_cloning.rescale_turns`), because the study compares what the imitation loss
 teaches. The turn gain is measured on recorded walks, which differ from those of a finetuned navigator, and with it
-collisions are too rare to compare learners. Only during the rounds of DAgger does the navigator walk with it.
+collisions are too rare to compare learners. The navigator walks with it only during the rounds of DAgger.
 
 | metric               | meaning                                                                                   |
 | -------------------- | ----------------------------------------------------------------------------------------- |

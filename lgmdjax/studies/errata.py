@@ -90,7 +90,7 @@ def _with_printed_shaping(robot: closed_loop.Params, folder: Path) -> closed_loo
 
 
 def _with_field(robot: closed_loop.Params, **changes: float) -> closed_loop.Params:
-    """Change what the detectors see of their pictures."""
+    """Change the field of view of the detectors, or its weights."""
     return assembly.with_camera(robot, replace(assembly.camera_settings(robot), **changes))
 
 

@@ -2,8 +2,8 @@
 
 An LGMD responds to expanding edges. A plain wall has no edges but its rims, so training cannot help; the study raises
 the wall's contrast step by step. A corner is visible, but both detectors respond alike, so the policy must choose the
-side. Eq. 22 has nothing to choose by. The teacher of this package goes on turning the way it has begun to, and a
-network with memory can learn that.
+side. Eq. 22 has no criterion for the choice. The teacher of this package continues to turn in the direction in which it
+began, and a network with memory can learn that.
 
 Writes failure_modes.json, a row for each trial, contrast and policy, and the walks.
 

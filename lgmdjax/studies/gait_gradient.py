@@ -1,7 +1,7 @@
 """Can the gait be fitted through the physics? Shaping networks and CPG, by gradient through the simulated body.
 
-The kinematic fit (`lgmdjax.locomotion.gait_fit`) puts the feet where the regular gait has them, but it does not model
-the body: feet slip, servos sag, the trunk sways. Here robots walk on an empty floor, each at a commanded velocity. The
+The kinematic fit (`lgmdjax.locomotion.gait_fit`) moves the feet as in the regular gait, but it does not model the
+body: feet slip, servos sag, the trunk sways. Here robots walk on an empty floor, each at a commanded velocity. The
 loss of a window (`lgmdjax.learning.gait_objective`) is
 
     L = mean over robots of ((s - s*) / 5 mm/s)^2 + ((w - w*) / 0.05 rad/s)^2 + 0.5 (a / a_0)^2 + 0.1 (e / e_0)^2,
@@ -17,8 +17,9 @@ with its own learning rate, the same initial parameters, and the same number of 
 | a, a_0   | sway   | rad   | of pitch and roll; a_0 before the fit                                                |
 | e, e_0   | effort | N m   | of the servos; e_0 before the fit                                                    |
 
-Fitted are the networks of the left legs (the right ones are their mirror image), the cycle time, and the coupling
-within and across the tripods. The gait is evaluated in C MuJoCo, with the contacts of the XML, before and after.
+The fitted parameters are the networks of the left legs (the right ones are their mirror image), the cycle time, and the
+coupling within and across the tripods. The gait is evaluated in C MuJoCo, with the contacts of the XML, before and
+after.
 
 Writes gait_gradient.json (a row for each method and seed), and shaping-<method>-<repeat>.safetensors.
 """
@@ -112,7 +113,7 @@ class Optimisation:
     label: str
     robot_seconds: float  # simulated time of one step, all robots together [s]
     steps: int
-    param_scales: GaitParams  # in units of which the parameters are updated
+    param_scales: GaitParams  # units in which the parameters are updated
     optimiser: optax.GradientTransformation
     update: Callable[..., tuple[GaitParams, optax.OptState, RobotTask, Array]]
 

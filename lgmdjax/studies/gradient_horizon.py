@@ -3,7 +3,7 @@
 Robots walk in random rooms up to `END_FRAME` minus the horizon, once, in double precision. From there on each robot has
 its own parameters. The loss is that of the frames up to `END_FRAME`, and the gradient is taken through the same frames.
 The longer the horizon, the larger the gradient's norm, because the walk is sensitive to earlier commands, and the fewer
-digits of it are left in float32.
+of its digits are correct in float32.
 
 | plotted    | meaning                                                                                          |
 | ---------- | ------------------------------------------------------------------------------------------------ |
@@ -82,7 +82,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: GradientHorizonSetti
 
 
 def _on_host(tree: PyTree) -> PyTree:
-    """Copy arrays to the host, from where `jnp.asarray` rounds them in single precision; keys stay as they are."""
+    """Copy arrays, but not random keys, to the host, so that `jnp.asarray` can round them to single precision."""
     return jax.tree.map(lambda a: a if jnp.issubdtype(jnp.result_type(a), jax.dtypes.prng_key) else np.asarray(a), tree)
 
 
@@ -107,7 +107,7 @@ def derivatives(
         problem: in the precision in which the derivative is taken.
         states: by horizon, from `states_before_end`.
         seed: of the random direction.
-        finite_differences: also take central differences, beside reverse and forward mode.
+        finite_differences: take central differences too, in addition to reverse and forward mode.
     """
     params = problem.robot.controller
     keys = jax.random.split(jax.random.key(seed), len(jax.tree.leaves(params)))

@@ -14,7 +14,7 @@ steps:
 
 Each seed has its own split of the rooms, its own order of the walks, and its own navigator. The navigator is trained on
 the training walks, and its turns are not rescaled. Its input constants, mean and standard deviation of the calibrated
-u, stay fixed: a frozen navigator needs the inputs that it was trained with, and one that is trained along can absorb
+u, stay fixed: a frozen navigator needs the inputs that it was trained with, and one that is trained as well can absorb
 other constants in the weights and biases of its first layer.
 
 A quarter of the rooms is held out; one half of it selects the best step of a fit, the other half is the test set. All

@@ -1,15 +1,15 @@
 """How much may camera, detector, room, body and training data differ from the baseline? One parameter at a time.
 
-The navigator is not trained again: the study measures how it does on another camera or robot. Only where the amount of
-data is the parameter are learners trained, on parts of the walks that the run recorded.
+The navigator is not trained again: the study measures how well it works with another camera or robot. Learners are
+trained only if the parameter is the amount of data, on parts of the walks that the run recorded.
 
 | parameter  | meaning                                                                             |
 | ---------- | ----------------------------------------------------------------------------------- |
 | T_s        | threshold of the detector                                                           |
 | T_f        | threshold of its feed-forward inhibition, as a multiple of the calibrated one        |
-| overlap    | share of the picture's width that each detector gets                                |
-| ground     | share of the picture's height, at the bottom, that no detector gets                 |
-| falloff    | exponent of the weights of a detector's cells beside the way                        |
+| overlap    | share of the picture's width that each detector sees                                |
+| ground     | share of the picture's height, at the bottom, that no detector sees                 |
+| falloff    | exponent of the weights of a detector's cells to the side of the robot's path       |
 | pixels     | width of a picture; cells keep their size in degrees                                |
 | cell       | side of a cell, in pixels of a benchmark picture                                    |
 | rate       | pictures per second                                                                 |
@@ -62,7 +62,7 @@ FRAME_INTERVALS = (1, 2, 3, 4)  # frames from one picture to the next
 CONTRAST_FACTORS = (0.25, 0.5, 0.75, 1.0, 1.25)
 SWAY_FACTORS = (0.0, 1.0, 2.0, 4.0)
 RATE_LIMIT = 60.0  # collisions per 100 m, top of the figure; higher rates become arrows
-MIN_SEGMENT = 30  # frames that a cut segment keeps at least
+MIN_SEGMENT = 30  # minimum number of frames of a cut segment
 DATA_FRACTIONS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the recorded minutes
 MAX_EPOCH_FACTOR = 10  # largest ratio of epochs, fits to less data over fits to all data
 ROOM_COUNTS = (8, 16, 32, 64, 128)
@@ -139,7 +139,7 @@ def baseline(robot: closed_loop.Params) -> dict[str, float]:
 
 
 def variations(robot: closed_loop.Params) -> Iterator[Variation]:
-    """Yield the robot with every parameter changed that needs no training."""
+    """Yield the variations of all parameters that need no training."""
     detector, eyes = robot.controller.lgmd, assembly.camera_settings(robot)
 
     def with_lgmd(**constants: Array | float) -> closed_loop.Params:
@@ -197,7 +197,7 @@ def matched_epochs(epochs: int, frames: int, subset_frames: int) -> int:
 def _take_frames(segments: Sequence[Walk], frames: int, generator: np.random.Generator) -> list[Walk]:
     """Take segments up to a total of `frames`; the last one is cut at a random place.
 
-    Cut at its beginning, it would show a robot just after a reset, with little near.
+    If its beginning were always taken, it would show robots just after a reset, with few obstacles near.
     """
     starts = np.cumsum([0, *map(len, segments)]).tolist()
     taken = []
@@ -210,7 +210,7 @@ def _take_frames(segments: Sequence[Walk], frames: int, generator: np.random.Gen
 
 
 def _balance_rooms(segments: Sequence[Walk], frames: int, generator: np.random.Generator) -> list[Walk]:
-    """Take a total of `frames`, equally many from each room as far as the rooms have them."""
+    """Take a total of `frames`, if possible equally many from each room."""
     rooms: dict[int, list[Walk]] = {}
     for segment in segments:
         rooms.setdefault(segment.room, []).append(segment)

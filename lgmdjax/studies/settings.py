@@ -1,4 +1,4 @@
-"""Settings of the studies. Imports no JAX, so that the command line can."""
+"""Settings of the studies. Imports no JAX, so that the command line needs none."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -115,7 +115,7 @@ TRANSFER_SIZES: Mapping[str, TransferSize] = {
     "quick": TransferSize(robots=4, seconds=30.0, seeds=4, scene_seconds=60.0),
     "full": TransferSize(robots=64, seconds=180.0, seeds=12, scene_seconds=90.0),
 }
-"""A frame of a robot takes 20 ms of one core: a row of random rooms a minute at quick, two hours at full."""
+"""One frame of one robot takes 20 ms of one core: a row in random rooms takes a minute at quick, two hours at full."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,7 @@ class TransferSettings:
     scale: Literal["smoke", "quick", "full"] = "quick"
     """how many robots walk for how long: minutes a row, or hours"""
     scenes: tuple[TrialName, ...] = ("indoor", "outdoor")
-    """scenes in which learned, teacher and blind walk, beside the random rooms"""
+    """scenes in which learned, teacher and blind walk, in addition to the random rooms"""
     faults: tuple[FaultName, ...] = FAULT_NAMES
     """faults, one at a time and together"""
 

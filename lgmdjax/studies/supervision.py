@@ -29,7 +29,7 @@ from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, recording
 from lgmdjax.studies.settings import SupervisionSettings
 
-# Eq. 22 with the paper's v_base and what is nearest, within the gait's range.
+# Eq. 22 with the paper's v_base and the nearest distances, within the gait's range.
 _PRINTED = braitenberg.Params(base=1.2, full_turn=0.0, tie_tolerance=0.0, corridor=0.0)
 RULES = {
     "2a": replace(_PRINTED, gain_3b=0.0),

@@ -1,4 +1,4 @@
-"""Does the trained robot avoid obstacles in a world that nothing was trained in, and which fault stops it?
+"""Does the trained robot avoid obstacles in a world in which nothing was trained, and which fault stops it?
 
 The robot is unchanged. In the other world C MuJoCo computes hard contacts of true shapes, OpenGL draws the pictures,
 surfaces are photographs or 1/f noise under a lamp that casts shadows, and some obstacles are spheres, chairs or rocks
@@ -11,9 +11,9 @@ surfaces are photographs or 1/f noise under a lamp that casts shadows, and some 
 | other  | the same with obstacles of other shapes                                                   |
 | faults | the other world, and a robot with one fault (`lgmdjax.transfer.faults`), or all `together` |
 
-Teacher and blind walk in own, other, and with all faults together; learned in every world. Writes transfer.json, a row
-for each world, trial and policy: its metrics, or the outcome in a scene. Walks are kept in Parquet, row by row, so that
-an interrupted study carries on.
+The policies teacher and blind walk in own, other, and with all faults together; learned walks in every world. Writes
+transfer.json, a row for each world, trial and policy: its metrics, or the outcome in a scene. The walks of each row are
+stored in Parquet, so that an interrupted study resumes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,7 +41,7 @@ from lgmdjax.world.mujoco_world import Style
 OWN, PRISMS, OTHER, TOGETHER = "own", "prisms", "other", "together"
 UNSEEN = "unseen"
 COMPARED: tuple[PolicyName, ...] = ("learned", "teacher", "blind")
-BATCH = 8  # robots that walk side by side, and one file
+BATCH = 8  # robots that are simulated at once and written to one file
 
 
 class Row(NamedTuple):
@@ -55,7 +55,7 @@ class Row(NamedTuple):
 
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: TransferSettings, seed: int) -> None:
-    """Walk every row, and score it."""
+    """Record the walks of every row, and score them."""
     robot = assembly.load_robot(inputs["fit-gait"], inputs["train"])
     rows = []
     for row in plan(settings):
@@ -66,7 +66,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TransferSettings, se
 
 
 def plan(settings: TransferSettings) -> Iterator[Row]:
-    """Yield the rows of the study; what tells most comes first."""
+    """Yield the rows of the study, the most informative ones first."""
     other = Style()
     for trial in (UNSEEN, *settings.scenes):
         for policy in COMPARED:
@@ -80,7 +80,7 @@ def plan(settings: TransferSettings) -> Iterator[Row]:
 
 
 def _record(folder: Path, robot: closed_loop.Params, row: Row, size: TransferSize, seed: int) -> closed_loop.Record:
-    """Walk the robots of a row, or read their walks if they are on disk."""
+    """Record the walks of a row, or read them if they are on disk."""
     count, seconds = (size.robots, size.seconds) if row.trial == UNSEEN else (size.seeds, size.scene_seconds)
     rooms = trials.sample_rooms(row.trial, count, seed)
     facts = {

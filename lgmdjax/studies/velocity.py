@@ -2,9 +2,9 @@
 
 Robots with the policy `blind` walk straight on through random rooms at 0.1 to 5 times the nominal velocity, the same
 distance at each. A frame counts as obstructed if the laser finds something within `NEAR` in a sector straight ahead,
-and as free if it finds nothing within `FAR`. Compared is u, the mean of both detectors averaged over about a gait
-cycle. The effect size is Cohen's d, the difference of the two means in pooled standard deviations: the larger it is,
-the better u shows whether the path is free.
+and as free if it finds nothing within `FAR`. The compared quantity is u, the mean of both detectors averaged over about
+a gait cycle. The effect size is Cohen's d, the difference of the two means in pooled standard deviations: the larger it
+is, the better u shows whether the path is free.
 
 Intervals are bootstrapped over robots, because the frames of one walk are correlated. Rooms differ much more than
 velocities do, so all velocities are compared in the same rooms: a velocity is as good as the best one unless its effect
@@ -141,7 +141,7 @@ def mark_best(measured: Sequence[tuple[Row, Float[np.ndarray, " resamples"]]]) -
     """Return the rows with `as_good` set; one resample holds the same robots, hence rooms, at all velocities."""
     rows, effects = [row for row, _ in measured], np.array([effects for _, effects in measured])
     best = _argmax([row.effect for row in rows])
-    worse = np.mean(effects < effects[best], axis=1)  # a resample without frames of both kinds counts for none
+    worse = np.mean(effects < effects[best], axis=1)  # false for a resample without frames of both kinds
     return [
         replace(row, as_good=math.isfinite(row.effect) and bool(share < 0.975))
         for row, share in zip(rows, worse, strict=True)
@@ -164,7 +164,7 @@ def _effect_size(near: np.ndarray, far: np.ndarray) -> tuple[float, float, float
 
 
 def _steady_frames(record: closed_loop.Record) -> Bool[np.ndarray, "robots frames"]:
-    """Select all frames but the first two seconds after a reset, those before a contact, and those of fallen robots."""
+    """Select all frames except the first two seconds after a reset, those before a contact, and those after a fall."""
     resets = np.asarray(record.resets)
     steady = np.zeros(resets.shape, bool)
     for robot, first, last in metrics.segment_bounds(resets):

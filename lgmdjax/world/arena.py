@@ -64,7 +64,7 @@ __all__ = [
     "validate",
 ]
 
-PICTURES = 4  # of a batch of rooms, that notebooks show
+PICTURES = 4  # rooms of a batch that notebooks show
 
 
 @struct.dataclass(kw_only=True)
@@ -125,7 +125,7 @@ def empty_room(
 
 
 def at_time(arena: Arena, time: ArrayLike) -> Arena:
-    """Return the room with its obstacles where they are at `time` [s]; in the result nothing moves."""
+    """Return the room with its obstacles at their positions at `time` [s]; in the result nothing moves."""
     return dataclasses.replace(
         arena, boxes=move_prisms(arena.boxes, time), cylinders=move_prisms(arena.cylinders, time)
     )
@@ -151,8 +151,8 @@ def clearance(
 ) -> Float[Array, " s"]:
     """Return the signed distance [m] of capsules to the nearest obstacle or wall, negative where they overlap.
 
-    The distance is exact and a problem in the plane: obstacles on the floor are higher than the robot, and those
-    overhead are out of reach. The floor is not an obstacle. Only x and y of `starts` and `ends` are used.
+    The distance is exact. It is computed in the plane, since obstacles on the floor are higher than the robot and those
+    overhead are out of its reach. The floor is not an obstacle. Only x and y of `starts` and `ends` are used.
 
     Gradient: that of the nearest feature; zero where the axis of a cylinder intersects that of a capsule.
 
@@ -203,7 +203,7 @@ def _distances(arena: Arena, p: Float[Array, "s 2"], q: Float[Array, "s 2"]) -> 
 
 
 def pose_clearances(arena: Arena, poses: Float[Array, "n 3"], ahead: float = 0.3) -> Float[Array, " n"]:
-    """Return the clearance [m] of poses (x, y, yaw), each with the line from it to the point `ahead` [m] in front."""
+    """Return the clearance [m] of the line from each pose (x, y, yaw) to the point `ahead` [m] in front of it."""
     xy, yaw = poses[:, :2], poses[:, 2]
     front = xy + ahead * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
     return clearance(arena, xy, front, jnp.zeros_like(yaw))
@@ -219,8 +219,7 @@ def sample_free_poses(
 ) -> Float[Array, "count 3"]:
     """Sample poses (x, y, yaw), each uniform among those whose `pose_clearances` are at least `margin` [m].
 
-    The result is the first free one of 64 candidates. If none is free, it is the room's `start`, so that every pose is
-    free.
+    Each is the first free one of 64 candidates. If none is free, it is the room's `start`, which is free.
     """
     low, high = arena.bounds[0::2], arena.bounds[1::2]
     # Sampled in float32 and cast, so that a key gives the same poses in both precisions.

@@ -1,6 +1,6 @@
 """A room seen from above, as SVG: walls, obstacles, start, and paths of robots.
 
-Obstacles overhead are dashed outlines, and moving ones are drawn where they begin. x is to the right, y up.
+Obstacles overhead are dashed outlines. Moving obstacles are drawn at their initial position. x is to the right, y up.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ Path = Float[ndarray, "_ _"]
 
 @runtime_checkable
 class Room(Protocol):
-    """What is shown of a room: an `arena.Arena`."""
+    """The fields of a room that are drawn; `arena.Arena` has them."""
 
     @property
     def bounds(self) -> AnyArray: ...
@@ -39,7 +39,7 @@ class Room(Protocol):
 
 
 def svg(arena: Room | None, robots: Sequence[Sequence[Path]] = (), marks: Sequence[Path] = ()) -> str:
-    """Return the picture of a room with paths of robots [m] and crosses at points; without a room, paths alone.
+    """Return a picture of a room, with paths of robots [m] and crosses at points; without a room, of the paths alone.
 
     >>> svg(None, [[np.array([[0.0, 0.0], [1.0, 1.0]])]]).count("<polyline")
     1

@@ -5,8 +5,8 @@
 | -      | vertices, about the middle of the obstacle's foot | m    |
 | s, t   | texture coordinates, 1 for a whole texture        | 1    |
 
-Triangles turn counter-clockwise as seen from outside. A vertex where the surface has an edge is there once for each
-side of it, so that each has its own normal.
+The vertices of a triangle are in counter-clockwise order as seen from outside. A vertex on an edge of the surface
+occurs once for each face that meets there, with the normal of that face.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull
 
-SIDES = 32  # of a cylinder: it is nowhere narrower than its circle by more than half a percent
+SIDES = 32  # faces of a cylinder, whose radius is then at most half a percent too small
 
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -61,7 +61,7 @@ def sphere(radius: float, tile: float) -> Mesh:
     flat = vertices.reshape(-1, 3)
     corners = flat[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return Mesh(flat, normals.reshape(-1, 3), texture.reshape(-1, 2), triangles[area > 1e-9])  # none at the poles
+    return Mesh(flat, normals.reshape(-1, 3), texture.reshape(-1, 2), triangles[area > 1e-9])  # no area at poles
 
 
 def rock(
@@ -83,7 +83,7 @@ def rock(
 
 
 def _walls(ends: np.ndarray, normals: np.ndarray, heights: tuple[float, float], tile: float) -> Mesh:
-    """Return upright rectangles over the lines between `ends` (n, 2, 2), with the normals (n, 2, 2) at these."""
+    """Return upright rectangles over the lines between `ends` (n, 2, 2), with the normals (n, 2, 2) at these points."""
     count = len(ends)
     z = np.broadcast_to(np.asarray(heights)[:, None], (count, 2, 2))
     vertices = np.concatenate([np.repeat(ends[:, None], 2, axis=1), z[..., None]], axis=-1)
@@ -98,7 +98,7 @@ def _walls(ends: np.ndarray, normals: np.ndarray, heights: tuple[float, float], 
 
 
 def _caps(outline: np.ndarray, heights: tuple[float, float], tile: float) -> tuple[Mesh, Mesh]:
-    """Return the lower and the upper end of a prism over a convex outline that turns counter-clockwise."""
+    """Return the bottom and the top face of a prism over a convex outline in counter-clockwise order."""
     count = len(outline)
     fan = np.stack([np.zeros(count - 2, int), np.arange(1, count - 1), np.arange(2, count)], axis=1)
     lower, upper = (

@@ -1,17 +1,17 @@
-"""A room as a world of C MuJoCo: its obstacles, walls and floor as geoms, with lights and textures, in an `MjSpec`.
+"""A room in C MuJoCo: obstacles, walls and floor as geoms of an `MjSpec`, with lights and textures.
 
 | group | geoms                                                                  |
 | ----- | ---------------------------------------------------------------------- |
-| 0     | seen and touched: floor, walls, and obstacles of other shapes          |
-| 1     | touched alone: the exact box, cylinder or sphere of an obstacle        |
-| 4     | seen alone: its mesh, which has texture coordinates                    |
+| 0     | visual and collision: floor, walls, and obstacles of other shapes      |
+| 1     | collision only: the exact box, cylinder or sphere of an obstacle       |
+| 4     | visual only: its mesh, which has texture coordinates                   |
 
-What is touched has contype `WORLD` and conaffinity `ROBOT`. An obstacle that moves is a mocap body; `place_obstacles`
-puts it where it is at a time.
+Collision geoms have contype `WORLD` and conaffinity `ROBOT`. An obstacle that moves is a mocap body, and
+`place_obstacles` sets its position.
 
-In a style with `shapes`, an obstacle that is wide enough (`MIN_HALF_WIDTH`) may be a sphere, a chair of capsules or a
-convex rock, within the outline of the prism that it stands for: starts that are free in our rooms are free here. Walls
-and obstacles without contrast, as in the trials before a white wall, stay plain.
+In a style with `shapes`, an obstacle that is wide enough (`MIN_HALF_WIDTH`) may become a sphere, a chair of capsules or
+a convex rock. The new shape is within the outline of the prism, so that a start that is free in our rooms is free here
+too. Walls and obstacles without contrast, as in the trials with a white wall, stay plain.
 """
 
 from collections.abc import Callable, Iterator
@@ -32,13 +32,13 @@ MIN_HALF_WIDTH = 0.175  # m; a sphere of this radius is as high as the robot (`a
 SEAT_HEIGHT, SLAT_RADIUS, SLAT_SPACING = 0.45, 0.018, 0.09  # m, of a chair
 TILES = (0.7, 1.4)  # m, range of the widths of a texture
 LAMP, FILL, AMBIENT = 0.5, 0.3, 0.6  # grey of a white surface that faces the lamp, or the light without shadows
-SHADOW_MAP = 256  # px over the room; each doubling doubles the time that a picture takes
+SHADOW_MAP = 256  # px over the room; twice as many take twice as long to render
 LAMP_DIRECTION, FILL_DIRECTION = (0.45, 0.3, -1.0), (-0.6, -0.5, -0.7)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Style:
-    """How a room looks, and which shapes its obstacles have."""
+    """Appearance of a room, and shapes of its obstacles."""
 
     photographs: bool = True  # otherwise plain, each surface with its mean grey
     shadows: bool = True  # two lamps, one of which casts shadows; otherwise every surface is equally bright
@@ -52,7 +52,7 @@ PLAIN = Style(photographs=False, shadows=False, shapes=False)
 class Obstacle(NamedTuple):
     """A prism of a room, as numbers."""
 
-    index: int  # boxes first, then cylinders; the rows of padding count
+    index: int  # counted over boxes, then cylinders, padding included
     is_box: bool
     centre: np.ndarray
     half_size: np.ndarray
@@ -77,7 +77,7 @@ def add_room(spec: mujoco.MjSpec, room: Arena, style: Style = PHOTOGRAPHIC, seed
 
 
 def obstacles(room: Arena) -> Iterator[Obstacle]:
-    """Yield the obstacles of a single room that are no padding."""
+    """Yield the obstacles of a single room, without padding."""
     index = 0
     for is_box, prisms in ((True, room.boxes), (False, room.cylinders)):
         for row in range(len(prisms.top)):
@@ -92,7 +92,7 @@ def obstacles(room: Arena) -> Iterator[Obstacle]:
 
 
 def place_obstacles(model: mujoco.MjModel, data: mujoco.MjData, room: Arena, time: float) -> None:
-    """Put the obstacles that move where they are at a time [s]."""
+    """Move each moving obstacle to its position at a time [s]."""
     if model.nmocap:
         for obstacle in obstacles(arena.at_time(room, time)):
             body = model.body(f"obstacle_{obstacle.index}")
@@ -101,7 +101,7 @@ def place_obstacles(model: mujoco.MjModel, data: mujoco.MjData, room: Arena, tim
 
 
 def touchable(model: mujoco.MjModel) -> np.ndarray:
-    """Return which geoms are obstacles or walls: all that the robot may touch but the floor."""
+    """Return a mask of the geoms of obstacles and walls: everything that the robot can touch except the floor."""
     is_world = (model.geom_contype & WORLD) > 0
     is_world[model.geom("floor").id] = False
     return is_world
@@ -112,7 +112,7 @@ def _on_host(room: Arena) -> Arena:
 
 
 def _light(spec: mujoco.MjSpec, room: Arena, style: Style) -> None:
-    """Set ambient light and lamps; the sky has one grey."""
+    """Set ambient light, lamps, and a sky of uniform grey."""
     for light in list(spec.lights):
         spec.delete(light)
     head, half = spec.visual.headlight, 0.5 * float(np.hypot(*(room.bounds[1::2] - room.bounds[0::2])))
@@ -144,7 +144,7 @@ def _add_texture(spec: mujoco.MjSpec, name: photographs.TextureName) -> None:
 def _add_material(
     spec: mujoco.MjSpec, name: str, texture: np.ndarray | Array, rng: np.random.Generator, *, repeat: float = 1.0
 ) -> None:
-    """Add a photograph as a material, or its grey where a room's `texture` has no contrast (or there are none)."""
+    """Add a random photograph as a material, or plain grey if `texture` has no contrast or the style no photographs."""
     brightness, contrast = float(texture[0]), float(texture[1])
     material = spec.add_material(name=name, specular=0.0, shininess=0.0)
     chosen = photographs.NAMES[rng.integers(len(photographs.NAMES))]
@@ -181,7 +181,7 @@ def _add_bounds(spec: mujoco.MjSpec, room: Arena, rng: np.random.Generator) -> N
 
 
 def _add_obstacle(spec: mujoco.MjSpec, obstacle: Obstacle, style: Style, rng: np.random.Generator) -> None:
-    """Add one obstacle as a body: its shape, and what is seen of it."""
+    """Add one obstacle as a body with its visual and collision geoms."""
     name, tile = f"obstacle_{obstacle.index}", rng.uniform(*TILES)
     half = [np.cos(obstacle.yaw / 2), 0.0, 0.0, np.sin(obstacle.yaw / 2)]
     body = spec.worldbody.add_body(name=name, pos=[*obstacle.centre, 0.0], quat=half, mocap=obstacle.moves)
@@ -225,7 +225,7 @@ def _add_rock(
 def _add_chair(
     spec: mujoco.MjSpec, body: mujoco.MjsBody, obstacle: Obstacle, _: float, __: np.random.Generator
 ) -> None:
-    """Add four legs, a seat and a back of capsules, which are plain."""
+    """Add four legs, a seat and a back, all plain capsules."""
     a, b = np.minimum(obstacle.half_size, 0.25) - SLAT_RADIUS
     back = SEAT_HEIGHT + 0.4
     legs = [((x, y, SLAT_RADIUS), (x, y, SEAT_HEIGHT if x > 0 else back)) for x in (-a, a) for y in (-b, b)]
@@ -249,7 +249,7 @@ SHAPES: tuple[Callable[[mujoco.MjSpec, mujoco.MjsBody, Obstacle, float, np.rando
 
 
 def _add_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, mesh: Mesh) -> mujoco.MjsGeom:
-    """Add a mesh as a geom that is seen and not touched."""
+    """Add a mesh as a visual geom, without contacts."""
     spec.add_mesh(
         name=body.name, uservert=mesh.vertices.ravel(), usernormal=mesh.normals.ravel(),
         usertexcoord=mesh.texture.ravel(), userface=mesh.triangles.ravel(),

@@ -131,7 +131,7 @@ def concatenate(first: Prisms, second: Prisms) -> Prisms:
 
 
 def move_prisms(prisms: Prisms, time: ArrayLike) -> Prisms:
-    """Return the prisms where they are at `time` [s], at rest there. They jump where arrives = departs."""
+    """Return the prisms at rest at their positions at `time` [s]. A prism with arrives = departs jumps."""
     duration = prisms.arrives - prisms.departs
     is_gradual = duration > 0
     elapsed = jnp.asarray(time, dtype=duration.dtype) - prisms.departs
@@ -148,8 +148,8 @@ def raise_prisms(prisms: Prisms, samples: Float[Array, "n 4"], share: Float[Arra
 
     Args:
         prisms: of one kind; inactive ones stay inactive.
-        samples: numbers in 0 .. 1: whether it is raised, its bottom, thickness and size.
-        share: of the prisms that are raised.
+        samples: numbers in 0 .. 1, which determine whether a prism is raised, its bottom, thickness and size.
+        share: fraction of the prisms that is raised.
     """
     chosen, height, thickness, size = (samples[:, column] for column in range(4))
     raised = (chosen < share) & ~is_inactive(prisms)

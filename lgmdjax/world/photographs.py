@@ -1,8 +1,9 @@
 """Photographs and noise as textures: brick, grass and gravel, and noise whose amplitude falls as 1/f.
 
-The photographs come with scikit-image, in the extra `photographs`. A texture is repeated over a surface, so each is
-mirrored at its right and lower edge: no seam is seen. Noise of amplitude 1/f (power 1/f^2) has the spectrum of natural
-scenes (Field 1987, J. Opt. Soc. Am. A 4, 2379); it is periodic by itself.
+The photographs come with scikit-image, in the extra `photographs`. Textures are repeated over a surface. Each
+photograph is therefore mirrored at its right and lower edge, so that no seam is visible. Noise of amplitude 1/f (power
+1/f^2) has the spectrum of natural scenes (Field 1987, J. Opt. Soc. Am. A 4, 2379); it is periodic and needs no
+mirroring.
 """
 
 from typing import Literal, get_args
@@ -19,8 +20,8 @@ except ImportError:  # the extra is not installed
 
 TextureName = Literal["brick", "grass", "gravel", "noise"]
 NAMES: tuple[TextureName, ...] = get_args(TextureName)
-SIZE = 512  # px, width of a texture; that of a photograph is half of it, at twice its pixels
-MEAN, DEVIATION = 118.0, 32.0  # grey, of the noise: the mean of the three photographs
+SIZE = 512  # px, width of a texture; a photograph is averaged down to half of it and mirrored
+MEAN, DEVIATION = 118.0, 32.0  # grey, of the noise: averages over the three photographs
 
 
 def load(name: TextureName) -> UInt8[np.ndarray, "size size"]:

@@ -1,7 +1,7 @@
 """Rooms and scenes: the paper's training and testing rooms, its real scenes, and random rooms.
 
-The paper's figure 10 shows its rooms without sizes; these are rooms of the same kind with sizes of ours. From the text
-of sec. 5 are the start of the testing room at (0, 2.5), the tube 1.25 m ahead in front of a white wall at 3 m, the box
+The paper's figure 10 shows its rooms without sizes; these are rooms of the same kind with our own sizes. The text of
+sec. 5 gives the start of the testing room at (0, 2.5), the tube 1.25 m ahead in front of a white wall at 3 m, the box
 1.2 m ahead with another to the right and a table to the left, the trees and bushes in front of a facade, and the
 obstacles that move into the way from the left and then from the right.
 
@@ -234,9 +234,9 @@ def with_random_textures(
     and can distinguish it from contrast only if contrasts are similar.
 
     The motion of the floor is equal in both eyes: it raises u and hardly changes the difference between the two.
-    However, a controller trained on plain floors only responds to a lawn as to a wall on either side. Random rooms, in
-    which the controller is trained, therefore have floors of all contrasts; the paper's rooms have those of a
-    laboratory.
+    However, a controller trained only on plain floors responds to a lawn as to a wall on each side. Random rooms, in
+    which the controller is trained, therefore have floors of all contrasts. The paper's rooms have floors of low
+    contrast, as in a laboratory.
     """
     boxes, cylinders = arena.boxes, arena.cylinders
     first, second = boxes.yaw.size, boxes.yaw.size + cylinders.yaw.size
@@ -258,7 +258,7 @@ def with_random_textures(
 
 
 def raise_obstacles(arena: Arena, key: Array, share: Float[Array, ""] | float) -> Arena:
-    """Return the room with a share of its obstacles overhead: things that the robot sees and can walk under."""
+    """Return the room with a share of its obstacles raised overhead: the robot sees them and walks under them."""
     boxes, cylinders = len(arena.boxes.top), len(arena.cylinders.top)
     samples = _sample_uniform(key, (boxes + cylinders, 4))
     return dataclasses.replace(

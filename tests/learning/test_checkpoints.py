@@ -60,7 +60,7 @@ def test_a_checkpoint_with_other_weights_is_refused(tmp_path, monkeypatch):
     with monkeypatch.context() as changed:
         changed.setattr("lgmdjax.learning.checkpoints._digest", lambda progress: "0" * 64)
         saved_fit(tmp_path)
-    with pytest.raises(InputError, match="another checksum than that of what was saved; remove it to start again"):
+    with pytest.raises(InputError, match="another checksum than the saved one; remove it to start again"):
         restored(tmp_path)
 
 

@@ -41,7 +41,7 @@ def test_what_is_as_expected_is_accepted(expected: schema.Schema, value: object)
         (Flag(), "yes", "true or false, got 'yes'"),
         (Flag(), 1, "true or false"),
         (Text(("a", "b")), "c", "one of a, b"),
-        (Text(), 1, "a text"),
+        (Text(), 1, "expected text"),
         (Numbers((2,)), np.ones(3), "shape (2,), got float64 of shape (3,)"),
         (Numbers((2,)), np.ones(2, int), "got int64"),
         (Numbers((2,)), np.ones(2, np.float16), "got float16"),

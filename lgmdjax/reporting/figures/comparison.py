@@ -1,4 +1,4 @@
-"""Plots that compare policies: how often they collide, and whether they go on."""
+"""Plots that compare policies: how often they collide, and how much floor they cover."""
 
 from collections.abc import Mapping
 

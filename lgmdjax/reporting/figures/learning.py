@@ -50,14 +50,14 @@ def plot_predictions(
     label: Float[ndarray, "frames 2"],
     predicted: Float[ndarray, "frames 2"],
 ) -> Figure:
-    """Plot a segment of recorded walking (fig. 12): u, free way, the rule's command and the learned policy's command.
+    """Plot a segment of recorded walking (fig. 12): u, free distance, and the commands of rule and learned policy.
 
     u oscillates with every step and is plotted with its mean over a second.
 
     Args:
         time: s.
         u: LGMD outputs.
-        corridor: how far the way ahead is free on either side, to which the rule reacts [m].
+        corridor: free distance ahead on either side, to which the rule reacts [m].
         label: the rule's command, in multiples of 0.05 m/s.
         predicted: the learned policy's command, in multiples of 0.05 m/s.
     """
@@ -88,7 +88,7 @@ def plot_predictions(
 def _average_over_second(
     time: Float[ndarray, " frames"], values: Float[ndarray, " frames"]
 ) -> Float[ndarray, " frames"]:
-    """Average over a second; at the ends over the part of it that is recorded."""
+    """Average over a second, of which only the recorded part counts at the ends."""
     rate = (len(time) - 1) / (time[-1] - time[0]) if len(time) > 1 else 1.0
     window = np.ones(min(max(round(rate), 1), len(time)))
     return np.convolve(values, window, mode="same") / np.convolve(np.ones_like(values), window, mode="same")

@@ -1,4 +1,4 @@
-"""Looming detectors on laboratory stimuli: what they answer to, and when."""
+"""Looming detectors on laboratory stimuli: what they respond to, and when."""
 
 from collections.abc import Sequence
 

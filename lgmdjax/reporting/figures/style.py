@@ -12,14 +12,14 @@ palette of Okabe & Ito, which colour-blind readers can tell apart.
 | `detection.plot_lgmd_layers`                  | 6b           | picture, E, I and S of one eye                       |
 | `detection.plot_grid_search`                  | -            | score of the candidates for T_s and W_I              |
 | `learning.plot_losses`                        | 11           | training and test error of every learner             |
-| `learning.plot_predictions`                   | 12           | u, d, the rule's v and the learned v over time       |
+| `learning.plot_predictions`                   | 12           | u, e, the rule's v and the learned v over time       |
 | `trajectories.plot_trajectories`              | 13           | walks of all policies in one room                    |
 | `trajectories.plot_walks`                     | -            | walks of a record in their rooms                     |
 | `trajectories.plot_passages`                  | 14, 16       | paths past an obstacle                               |
 | `comparison.plot_collision_rates`             | -            | collisions per 100 m of every policy, with intervals |
+| `comparison.plot_collisions_against_coverage` | -            | the same against the coverage of every policy        |
 | `stimulus_scores.plot`                        | -            | looming detectors on laboratory stimuli              |
 | `clip_scores.plot_roc`, `plot_clip`           | -            | looming detectors on video clips                     |
-| `comparison.plot_collisions_against_coverage` | -            | the same against the floor that every policy sees    |
 """
 
 import io
