@@ -40,8 +40,9 @@ def main(run: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], figur
     for record in copy.glob("*/done.json"):
         facts = json.loads(record.read_text(encoding="utf-8"))
         files = {name: size for name, size in facts["files"].items() if (record.parent / name).is_file()}
-        was_sealed = facts.pop(checksums.SEAL, None) is not None  # those of older versions are not
-        write_json(record, checksums.seal(facts | {"files": files}) if was_sealed else facts | {"files": files})
+        had_checksum = facts.pop(checksums.CHECKSUM_KEY, None) is not None  # those of older versions are not
+        facts["files"] = files
+        write_json(record, checksums.add_checksum(facts) if had_checksum else facts)
     for folder in sorted(copy.rglob("*"), reverse=True):
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()

@@ -19,7 +19,7 @@ MAX_ROWS = 80
 CELL = "text-align: left; vertical-align: top"
 
 
-class Shown:
+class NotebookTable:
     """A dataclass that notebooks show as a table of its parts: name, value, unit and meaning."""
 
     def _repr_html_(self) -> str:

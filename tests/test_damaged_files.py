@@ -50,7 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer = episodes.Writer(folder / "collect" / "episodes", {"robots": 2})
     writer.write(synthetic.walk(robots=2, frames=20), episode=0, rooms=[0, 1], seed=0)
     facts = {"format": run_folders.FORMAT, "scale": "smoke", "seed": 0, "settings": {}, "versions": {"jax": "0.9.2"}}
-    storage.write_json(folder / "run.json", checksums.seal(facts))
+    storage.write_json(folder / "run.json", checksums.add_checksum(facts))
     return folder
 
 

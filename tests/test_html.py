@@ -39,19 +39,19 @@ class Cells(HTMLParser):
             self.rows[-1][-1] += data
 
 
-def shown(thing: html.Shown) -> dict[str, list[str]]:
+def shown(thing: html.NotebookTable) -> dict[str, list[str]]:
     """Return value and comment of each row of a table by its name."""
     return {row[0]: row[1:] for row in Cells(thing._repr_html_()).rows}
 
 
 @dataclass
-class Inner(html.Shown):
+class Inner(html.NotebookTable):
     x: float  # m, "quoted" & <escaped>
     flags: np.ndarray
 
 
 @dataclass
-class Outer(html.Shown):
+class Outer(html.NotebookTable):
     """A tree."""
 
     inner: Inner

@@ -35,7 +35,7 @@ class Params:
 
 
 @struct.dataclass(kw_only=True)
-class Body:
+class BodyFaults:
     """How a body differs from its model; by default it does not."""
 
     gain: Float[Array, "6 3"] | float = 1.0  # factor of k_p
@@ -73,7 +73,7 @@ def step(
     return State(waiting=waiting, output=output), output
 
 
-def apply_to_model(model: mujoco.MjModel, body: Body) -> mujoco.MjModel:
+def apply_to_model(model: mujoco.MjModel, body: BodyFaults) -> mujoco.MjModel:
     """Return a copy of a robot's model whose servos, friction and mass differ; `hexapod.build` converts it to MJX.
 
     The payload is in the middle of the trunk, whose inertia grows in proportion.

@@ -17,8 +17,8 @@ def run_bench(flags: BenchFlags) -> Iterator[str]:
     """Score the detectors; yield a line about each, then the names of the files."""
     names = list(dict.fromkeys(name for given in flags.detector for name in _expand(given)))
     for name in names:
-        stimulus_scores.find(name)  # refuse a wrong name before the work begins
-    clips = stimulus_scores.make_bench(STIMULUS_SCALES[flags.scale], flags.seed)
+        stimulus_scores.get_detector(name)  # refuse a wrong name before the work begins
+    clips = stimulus_scores.render_clips(STIMULUS_SCALES[flags.scale], flags.seed)
     rows: list[JsonObject] = []
     for name in names:
         rows.append(stimulus_scores.score(name, clips))

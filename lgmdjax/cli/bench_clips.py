@@ -48,7 +48,7 @@ def run_clips(flags: BenchFlags) -> Iterator[str]:
     traces: dict[str, list[Trace]] = {}
     rows: list[JsonObject] = []
     for name in names:
-        contestant = stimulus_scores.find(name)
+        contestant = stimulus_scores.get_detector(name)
         traces[name] = [clip_responses.respond(contestant, clip) for clip in clips]
         rows.append(score(name, clips, traces[name]))
         yield _line(rows[-1])
@@ -89,7 +89,7 @@ def _choose(given: Sequence[str]) -> list[str]:
     seeing = [name for name, each in stimulus_scores.DETECTORS.items() if not each.is_ideal]
     names = list(dict.fromkeys(name for each in given for name in (seeing if each == "all" else [each])))
     for name in names:
-        if stimulus_scores.find(name).is_ideal:
+        if stimulus_scores.get_detector(name).is_ideal:
             choices = ", ".join(seeing)
             raise InputError(
                 f"expected detectors of frames, got {name}, which is given the geometry; choose from {choices}"

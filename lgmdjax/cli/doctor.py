@@ -38,15 +38,15 @@ def run_checks(out: Path) -> int:
         out: folder that run folders would be written to.
     """
     checks: dict[str, Callable[[], Finding]] = {
-        "python": python,
-        "packages": packages,
-        "environment": variables,
-        "devices": devices,
-        "arithmetic": arithmetic,
-        "physics": physics,
-        "video": video_codec,
-        "disk": lambda: disk(out),
-        "folder": lambda: folder(out),
+        "python": check_python,
+        "packages": check_packages,
+        "environment": check_variables,
+        "devices": check_devices,
+        "arithmetic": check_arithmetic,
+        "physics": check_physics,
+        "video": check_video_codec,
+        "disk": lambda: check_disk(out),
+        "folder": lambda: check_folder(out),
     }
     failed = False
     for name, check in checks.items():
@@ -59,7 +59,7 @@ def run_checks(out: Path) -> int:
     return int(failed)
 
 
-def python() -> Finding:
+def check_python() -> Finding:
     """Check the version of Python against the range in pyproject.toml."""
     installed = sys.version.split()[0]
     if (3, 11) <= sys.version_info[:2] <= (3, 13):
@@ -67,7 +67,7 @@ def python() -> Finding:
     return Finding(FAIL, f"expected 3.11 to 3.13, found {installed}; make a new environment with one of those")
 
 
-def packages() -> Finding:
+def check_packages() -> Finding:
     """Check the version of every dependency against the range in this package's metadata."""
     try:
         wanted = [Requirement(line) for line in requires("lgmdjax") or ()]
@@ -96,13 +96,13 @@ def packages() -> Finding:
     return Finding(OK, ", ".join(accepted))
 
 
-def variables() -> Finding:
+def check_variables() -> Finding:
     """Start the libraries that read environment variables, and name those that are set."""
     environment.check()
     return Finding(OK, jax_setup.user_variables() or "no variable of JAX, MuJoCo or Matplotlib is set")
 
 
-def devices() -> Finding:
+def check_devices() -> Finding:
     """Name the devices that JAX computes on; warn about a GPU that it does not use."""
     import jax  # inside each check, so that a package that cannot be imported is a finding
 
@@ -113,7 +113,7 @@ def devices() -> Finding:
     return Finding(OK, text)
 
 
-def arithmetic() -> Finding:
+def check_arithmetic() -> Finding:
     """Run a small program that some releases of JAX compile to wrong numbers (jax#39103)."""
     import jax
     import jax.numpy as jnp
@@ -130,7 +130,7 @@ def arithmetic() -> Finding:
     return Finding(OK, f"{CANARY_ROWS} results right under jit in float64")
 
 
-def physics() -> Finding:
+def check_physics() -> Finding:
     """Compare one physics step of the hexapod, from random velocities, in MJX and in C MuJoCo."""
     import jax
     import jax.numpy as jnp
@@ -160,7 +160,7 @@ def physics() -> Finding:
     return Finding(FAIL, f"{text}, expected less than {STEP_TOLERANCE:g}; install mujoco from requirements.lock")
 
 
-def video_codec() -> Finding:
+def check_video_codec() -> Finding:
     """Encode a few frames with H.264 in memory, decode them, and count them."""
     import av
 
@@ -177,7 +177,7 @@ def video_codec() -> Finding:
     return Finding(OK if decoded == FRAMES else FAIL, f"{codec}: {decoded} of {FRAMES} frames encoded and decoded")
 
 
-def disk(out: Path) -> Finding:
+def check_disk(out: Path) -> Finding:
     """Check that the disk has space for a run."""
     free = shutil.disk_usage(_existing_parent(out)).free / 1e9
     level = OK if free >= ENOUGH_GB else WARN if free >= MIN_GB else FAIL
@@ -185,7 +185,7 @@ def disk(out: Path) -> Finding:
     return Finding(level, f"{free:.1f} GB free for {out}{advice}")
 
 
-def folder(out: Path) -> Finding:
+def check_folder(out: Path) -> Finding:
     """Check that files can be written to the folder, or to its nearest existing parent."""
     parent = _existing_parent(out)
     try:

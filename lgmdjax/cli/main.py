@@ -270,7 +270,7 @@ def exit_code(command: Callable[[], int | None], afterwards: str = RESUMES) -> i
     """
     interrupted = f"lgmdjax: interrupted; {afterwards}"
     try:
-        with _writable_output(), interruption.obeying(interrupted):
+        with _writable_output(), interruption.handling_signals(interrupted):
             return command() or 0
     except (InputError, OSError) as error:
         return _complain(f"lgmdjax: {one_line(error)}", 2)
@@ -374,5 +374,5 @@ def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequen
     run = open_run(given.out, given.name, given.scale, given.seed, given.settings)
     from lgmdjax.pipeline.stages import STAGES
 
-    with tracking.following(given.track, run.folder):
+    with tracking.log_to(given.track, run.folder):
         return execute(run, STAGES, target)

@@ -64,7 +64,7 @@ def run_study(name: str, flags: StudyFlags) -> Path:
 
     facts = {name: flags.settings, "robot": assembly.fingerprint(robot)}
     run = open_run(flags.out, flags.name or f"{name}-{flags.seed}", "study", flags.seed, facts)
-    with tracking.following(flags.track, run.folder):
+    with tracking.log_to(flags.track, run.folder):
         return execute(run, (Stage(name=name, run=work),), name)
 
 

@@ -25,7 +25,7 @@ def check(track: str) -> None:
 
 
 @contextlib.contextmanager
-def following(track: str, run: Path) -> Iterator[None]:
+def log_to(track: str, run: Path) -> Iterator[None]:
     """Log the curves of fits as `track` says: not at all if empty, to event files in a run folder, or to a function."""
     check(track)
     if not track:
@@ -40,10 +40,10 @@ def following(track: str, run: Path) -> Iterator[None]:
                     writer.add_scalar(name.replace(" ", "_"), value, step)
 
             print(f"look at the curves with `tensorboard --logdir {run / FOLDER}`", flush=True)
-            with tracking.listening(write):
+            with tracking.add_listener(write):
                 yield
     else:
-        with tracking.listening(_explaining(_find(track), track)):
+        with tracking.add_listener(_explaining(_find(track), track)):
             yield
 
 

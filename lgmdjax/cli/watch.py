@@ -54,14 +54,14 @@ class StereoLayout:
     width: int = 320  # px of one picture; wider ones are averaged down to it
 
 
-class Watched(NamedTuple):
+class WatchResult(NamedTuple):
     """The files written, and the alarms."""
 
     files: list[Path]
     alarms: list[JsonObject]  # with start and end [s]
 
 
-def watch_video(flags: WatchFlags) -> Watched:
+def watch_video(flags: WatchFlags) -> WatchResult:
     """Run both detectors on the video of the flags."""
     if flags.mono and flags.stereo is not None:
         raise InputError("expected --mono or --stereo, got both; leave one out")
@@ -74,7 +74,7 @@ def watch_video(flags: WatchFlags) -> Watched:
         reader = video_io.open_reader(Path(name))
     layout, params = _settings(flags)
     with reader as video:
-        return detect_in(
+        return detect_looming_in_video(
             video, Path(name), flags.out, layout=layout, params=params, table=flags.table, overlay=flags.overlay
         )
 
@@ -108,16 +108,16 @@ def detect_looming(
     params: Detectors,
     table: TableFormat = "csv",
     overlay: bool = True,
-) -> Watched:
+) -> WatchResult:
     """Run both detectors on a video; files are written to out/<name of the video>/.
 
     Raises InputError, and writes nothing, if the video is missing, damaged, too short, or does not fit the layout.
     """
     with video_io.open_reader(path) as video:
-        return detect_in(video, path, out, layout=layout, params=params, table=table, overlay=overlay)
+        return detect_looming_in_video(video, path, out, layout=layout, params=params, table=table, overlay=overlay)
 
 
-def detect_in(
+def detect_looming_in_video(
     video: video_io.Video,
     path: Path,
     out: Path,
@@ -126,7 +126,7 @@ def detect_in(
     params: Detectors,
     table: TableFormat = "csv",
     overlay: bool = True,
-) -> Watched:
+) -> WatchResult:
     """Run both detectors on an open video; arguments, files and errors as for `detect_looming`."""
     lgmd.check(params.lgmd)
     alarm.check(params.alarm)
@@ -153,7 +153,7 @@ def detect_in(
     written = [f"response.{table}", "response.png", "alarms.json", *(["overlay.mp4"] if overlay else [])]
     for earlier in {"response.csv", "response.parquet", "overlay.mp4"} - set(written):
         (folder / earlier).unlink(missing_ok=True)
-    return Watched([folder / name for name in written], alarms)
+    return WatchResult([folder / name for name in written], alarms)
 
 
 def _print_notes(path: Path, video: video_io.Video) -> None:
@@ -226,8 +226,8 @@ def _step(
     ordered = _outermost_first(params.lgmd, pictures)
     layers = jax.vmap(partial(lgmd.layers, params.lgmd))(seen, ordered)
     seen, response = jax.vmap(partial(lgmd.step, params.lgmd))(seen, ordered)
-    views = alarm.View(frame=pictures, excitation=response.excitation)
-    adapting, adapted = jax.vmap(partial(alarm.step, params.alarm))(adapting, views)
+    inputs = alarm.AlarmInput(frame=pictures, excitation=response.excitation)
+    adapting, adapted = jax.vmap(partial(alarm.step, params.alarm))(adapting, inputs)
     curves = [response.u, response.feed_forward, response.excitation, adapted.adapted, adapted.alarm]
     _, rows, columns = pictures.shape
     shown = jax.tree.map(partial(_to_pixels, params.lgmd, (rows, columns)), layers)

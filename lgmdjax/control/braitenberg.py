@@ -44,7 +44,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.locomotion.shaping import MAX_VELOCITY, MIN_VELOCITY
 from lgmdjax.minmax import clip, maximum, minimum
 
@@ -54,7 +54,7 @@ MIN_DISTANCE = 0.01  # m; shorter distances are clipped to it, so that 1/d stays
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Gains of the rule (paper sec. 4.2), range of the gait, minimum turn and tie-break.
 
     With `full_turn` and `tie_tolerance` zero the teacher is eq. 22 with `limit`. With one gain zero as well it is a

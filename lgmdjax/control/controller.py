@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
 from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.sensors import hemifield
 
@@ -35,7 +35,7 @@ Frames = Float[Array, "2 height width"] | UInt8[Array, "2 height width"]
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """All parameters between camera and servos that can be differentiated."""
 
     lgmd: lgmd.Params

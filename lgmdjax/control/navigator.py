@@ -44,7 +44,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from lgmdjax.control import lstm
 from lgmdjax.control.names import VARIANTS, Variant
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.runtime import schema, storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
@@ -59,7 +59,7 @@ SCALES = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Weights by layer, and means and standard deviations of u and v in the training data."""
 
     weights: dict[str, PyTree]

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from lgmdjax.control import braitenberg, navigator
 from lgmdjax.control.names import POLICY_NAMES
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 
 ParamsT = TypeVar("ParamsT")
 StateT = TypeVar("StateT")
@@ -32,7 +32,7 @@ GAIT_RANGE = braitenberg.Params()  # of which `limit` reads the range of the gai
 
 
 @struct.dataclass(kw_only=True)
-class Observation(Shown):
+class Observation(NotebookTable):
     """What a policy may use in one frame: outputs of the two LGMDs and distances on either side, left first."""
 
     u: Float[Array, "2"]  # LGMD output, 0.5..1
@@ -60,14 +60,14 @@ class Policy(Generic[ParamsT, StateT]):
 
 
 @struct.dataclass(kw_only=True)
-class BlindParams(Shown):
+class BlindParams(NotebookTable):
     """The constant velocity of policy blind."""
 
     velocity: Float[Array, "2"]
 
 
 @struct.dataclass(kw_only=True)
-class DirectParams(Shown):
+class DirectParams(NotebookTable):
     """Eq. 22 on the outputs of the LGMDs: `gain` [1/m] times u - 0.5 replaces 1/d."""
 
     rule: braitenberg.Params
@@ -75,7 +75,7 @@ class DirectParams(Shown):
 
 
 @struct.dataclass(kw_only=True)
-class ReplayParams(Shown):
+class ReplayParams(NotebookTable):
     """Velocities that the teacher commanded, one per frame, in rooms other than the present one."""
 
     velocities: Float[Array, "frames 2"]
@@ -138,7 +138,7 @@ def get_policy(name: str) -> Policy:
 
 
 @struct.dataclass(kw_only=True)
-class PolicySwitch(Shown):
+class PolicySwitch(NotebookTable):
     """The parameters of all five policies, in the order of `POLICIES`, and the index of the active one."""
 
     active: Int[Array, ""]

@@ -3,19 +3,19 @@
 A detector's own u measures how much moves. In a street it is near 1 all the time, in a laboratory near 0.5. An approach
 shows in both as a rise of the excitation: over some tenths of a second it exceeds its mean over the last seconds.
 
-| symbol    | name                 | unit   | equation                                                       |
-| --------- | -------------------- | ------ | -------------------------------------------------------------- |
-| E_f       | view.excitation      | any    | of the detector                                                |
-| P_f       | -                    | grey   | change of the frame, averaged over blocks of its width / 16    |
-| M_f       | -                    | grey   | mean of |P_f|                                                  |
-| D_f       | -                    | grey   | median of P_f: the change that the whole field has in common   |
-| <x>_tau   | -                    | as x   | running mean of x with the time constant tau                   |
-| w_f       | response.whole_field | 0..1   | min(|<D>_fast| / <M>_fast, 1)                                  |
-| e_f       | -                    | any    | (1 - w_f) E_f                                                  |
-| A_f       | response.adapted     | 0..1   | <e>_fast / (<e>_fast + <e>_slow)                               |
-| h_f       | state.lasted         | s      | h_{f-1} + dt where A_f >= threshold, else 0                    |
-| -         | response.alarm       | 0, 1   | 1 where h_f >= persistence, and at least one frame             |
-| dt        | frame_time           | s      | -                                                              |
+| symbol    | name                       | unit   | equation                                                       |
+| --------- | -------------------------- | ------ | -------------------------------------------------------------- |
+| E_f       | inputs.excitation          | any    | of the detector                                                |
+| P_f       | -                          | grey   | change of the frame, averaged over blocks of its width / 16    |
+| M_f       | -                          | grey   | mean of |P_f|                                                  |
+| D_f       | -                          | grey   | median of P_f: the change that the whole field has in common   |
+| <x>_tau   | -                          | as x   | running mean of x with the time constant tau                   |
+| w_f       | response.whole_field       | 0..1   | min(|<D>_fast| / <M>_fast, 1)                                  |
+| e_f       | -                          | any    | (1 - w_f) E_f                                                  |
+| A_f       | response.adapted           | 0..1   | <e>_fast / (<e>_fast + <e>_slow)                               |
+| h_f       | state.time_above_threshold | s      | h_{f-1} + dt where A_f >= threshold, else 0                    |
+| -         | response.alarm             | 0, 1   | 1 where h_f >= persistence, and at least one frame             |
+| dt        | frame_time                 | s      | -                                                              |
 
 A is 1/2 where the excitation is constant, 2/3 where it has doubled, 3/4 where it has tripled: the logistic function of
 ln(<e>_fast / <e>_slow). It is 1/2 before anything has moved. Four points:
@@ -80,11 +80,11 @@ class State:
     shift: RunningMean  # of D
     fast: RunningMean  # of e
     slow: RunningMean  # of e
-    lasted: Scalar  # h, s
+    time_above_threshold: Scalar  # h, s
 
 
 @struct.dataclass(kw_only=True)
-class View:
+class AlarmInput:
     """A frame, and the excitation of the detector in it."""
 
     frame: Float[Array, "height width"]  # grey levels 0..255
@@ -116,19 +116,19 @@ def init(params: Params, frame: Float[Array, "height width"]) -> State:
     blocks = _blocks(frame)
     zero = jnp.zeros((), blocks.dtype)
     nothing = RunningMean(total=zero, weight=zero)
-    return State(blocks=blocks, change=nothing, shift=nothing, fast=nothing, slow=nothing, lasted=zero)
+    return State(blocks=blocks, change=nothing, shift=nothing, fast=nothing, slow=nothing, time_above_threshold=zero)
 
 
-def step(params: Params, state: State, view: View) -> tuple[State, Response]:
+def step(params: Params, state: State, inputs: AlarmInput) -> tuple[State, Response]:
     """Process the next frame.
 
     >>> state = init(Params(), jnp.zeros((12, 16)))
-    >>> view = View(frame=jnp.zeros((12, 16)), excitation=jnp.asarray(0.0))
-    >>> _, response = step(Params(), state, view)
+    >>> inputs = AlarmInput(frame=jnp.zeros((12, 16)), excitation=jnp.asarray(0.0))
+    >>> _, response = step(Params(), state, inputs)
     >>> float(response.adapted), float(response.alarm)
     (0.5, 0.0)
     """
-    blocks = _blocks(view.frame)
+    blocks = _blocks(inputs.frame)
     P = blocks - state.blocks
     M, D = jnp.mean(jnp.abs(P)), jnp.median(P)
     moved = jnp.where(M > STILL, jnp.ones_like(M), jnp.zeros_like(M))
@@ -136,13 +136,13 @@ def step(params: Params, state: State, view: View) -> tuple[State, Response]:
     change, shift = _update(state.change, M, gain_fast), _update(state.shift, D, gain_fast)
     w = _ratio(jnp.abs(shift.value), change.value, 0.0)
     w = jnp.where(w < 1, w, jnp.ones_like(w))
-    e = (1.0 - w) * jnp.asarray(view.excitation, blocks.dtype)
+    e = (1.0 - w) * jnp.asarray(inputs.excitation, blocks.dtype)
     fast, slow = _update(state.fast, e, gain_fast), _update(state.slow, e, gain_slow)
     A = _ratio(fast.value, fast.value + slow.value, 0.5)
-    h = jnp.where(params.threshold <= A, state.lasted + params.frame_time, jnp.zeros_like(A))
+    h = jnp.where(params.threshold <= A, state.time_above_threshold + params.frame_time, jnp.zeros_like(A))
     is_alarm = (h > 0) & (h >= params.persistence - 0.5 * params.frame_time)
     alarm = jnp.where(is_alarm, jnp.ones_like(A), jnp.zeros_like(A))
-    after = State(blocks=blocks, change=change, shift=shift, fast=fast, slow=slow, lasted=h)
+    after = State(blocks=blocks, change=change, shift=shift, fast=fast, slow=slow, time_above_threshold=h)
     return after, Response(adapted=A, whole_field=w, alarm=alarm)
 
 

@@ -99,7 +99,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
         state: from the last frame.
         frame: grey levels 0..255.
     """
-    state = perceive(params, state, frame)
+    state = filter_frame(params, state, frame)
     motion = correlate(state)
     right, up = motion.rightward, motion.upward
     outward = jnp.mean(_side(right, 1) * right) - jnp.mean(_side(up, 0)[:, None] * up)
@@ -108,7 +108,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
     return state, response
 
 
-def perceive(params: Params, state: State, frame: Float[Array, "height width"]) -> State:
+def filter_frame(params: Params, state: State, frame: Float[Array, "height width"]) -> State:
     """Return the signals of the next frame."""
     require_frame("emd", frame)
     pooled, dt = pool(frame, params.pooling) / GREY, params.frame_time

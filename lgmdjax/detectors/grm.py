@@ -71,7 +71,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
         state: from the last frame.
         frame: grey levels 0..255.
     """
-    state = emd.perceive(params.motion, state, frame)
+    state = emd.filter_frame(params.motion, state, frame)
     R = emd.correlate(state).rightward
     half = R.shape[1] // 2
     left, right = jnp.mean(rectify(R[:, :half])), jnp.mean(rectify(-R[:, R.shape[1] - half :]))

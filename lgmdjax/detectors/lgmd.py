@@ -61,7 +61,7 @@ from jaxtyping import Array, Float
 
 from lgmdjax.detectors import cells
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 
 KERNEL_RADIUS = 2  # n of eq. 8: inhibition extends over two rows and columns
 U_AT_REST = cells.U_AT_REST
@@ -79,7 +79,7 @@ KERNEL = (
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Constants of the detector.
 
     T_s and T_f depend on resolution, textures and speed; `lgmdjax.learning.lgmd_grid_search` calibrates them.

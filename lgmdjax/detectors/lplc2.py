@@ -117,7 +117,7 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
         state: from the last frame.
         frame: grey levels 0..255.
     """
-    state = emd.perceive(params.motion, state, frame)
+    state = emd.filter_frame(params.motion, state, frame)
     units = _units(params, directions(emd.correlate(state)))
     E = jnp.mean(units)
     return state, Response(u=jax.nn.sigmoid(params.gain * E), excitation=E, units=units)

@@ -124,8 +124,8 @@ def _advance(
     def advance(states: PyTree, frame: Array) -> tuple[PyTree, tuple[Array, ...]]:
         seen, adapting = states
         seen, response = step(params, seen, frame)
-        view = alarm.View(frame=frame, excitation=response.excitation)
-        adapting, adapted = alarm.step(scale, adapting, view)
+        given = alarm.AlarmInput(frame=frame, excitation=response.excitation)
+        adapting, adapted = alarm.step(scale, adapting, given)
         return (seen, adapting), (response.u, response.excitation, adapted.adapted, adapted.whole_field)
 
     return jax.lax.scan(advance, states, frames)

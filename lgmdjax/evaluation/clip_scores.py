@@ -62,7 +62,7 @@ class Counts(NamedTuple):
     leads: Float[np.ndarray, "persistences thresholds"]  # s; nan without a hit or a time of contact
     false_alarms: Float[np.ndarray, "persistences thresholds"]
     alarmed: Float[np.ndarray, "persistences thresholds"]  # stretches in which there is an alarm
-    stretches: int
+    negative_segments: int  # number of stretches
     minutes: float
     is_approach: bool
 
@@ -106,7 +106,7 @@ def score(series: Sequence[Series]) -> JsonObject:
             summarise(counts, [choose_without(halves[0] if k in halves[0] else halves[1]) for k in everything])
         ),
         "roc": roc(counts, best[0]),
-        "alarms": [begin(each, Setting(float(thresholds[best[1]]), PERSISTENCES[best[0]])) for each in series],
+        "alarms": [alarm_onsets(each, Setting(float(thresholds[best[1]]), PERSISTENCES[best[0]])) for each in series],
     }
 
 
@@ -122,7 +122,7 @@ def score_fixed(series: Sequence[Series], setting: Setting) -> JsonObject:
     return asdict(summarise(counts, [(0, 0)] * len(counts)))
 
 
-def begin(series: Series, setting: Setting) -> list[float]:
+def alarm_onsets(series: Series, setting: Setting) -> list[float]:
     """Return when the alarms begin [s]."""
     is_on = _alarmed(series, np.asarray([setting.threshold]), setting.persistence)
     return series.time[_onsets(is_on, series.rate)[:, 0]].tolist()
@@ -151,7 +151,7 @@ def count(series: Series, thresholds: Float[np.ndarray, " thresholds"], persiste
         leads=np.asarray(leads),
         false_alarms=np.asarray([(_onsets(each, series.rate) & before[:, None]).sum(axis=0) for each in is_on], float),
         alarmed=np.asarray([sum((each[part].any(axis=0) for part in stretches), none) for each in is_on]),
-        stretches=len(stretches),
+        negative_segments=len(stretches),
         minutes=float(before.sum()) / series.rate / 60,
         is_approach=series.label.is_approach,
     )
@@ -188,7 +188,7 @@ def _stretches(series: Series) -> list[np.ndarray]:
 def choose(counts: Sequence[Counts]) -> tuple[int, int]:
     """Return the indices of persistence and threshold that do best on some clips."""
     approaches = max(sum(each.is_approach for each in counts), 1)
-    stretches = max(sum(each.stretches for each in counts), 1)
+    stretches = max(sum(each.negative_segments for each in counts), 1)
     hits = np.sum([each.hits & each.is_approach for each in counts], axis=0) / approaches
     merit = hits - np.sum([each.alarmed for each in counts], axis=0) / stretches
     is_best = merit >= merit.max() - LEVEL
@@ -259,7 +259,7 @@ def peak_is_at_contact(series: Series) -> bool:
 def roc(counts: Sequence[Counts], persistence: int) -> JsonObject:
     """Return hit rate and share of stretches with a false alarm for every threshold, at one persistence."""
     approaches = sum(each.is_approach for each in counts)
-    stretches = max(sum(each.stretches for each in counts), 1)
+    stretches = max(sum(each.negative_segments for each in counts), 1)
     hits = np.sum([each.hits[persistence] & each.is_approach for each in counts], axis=0)
     alarmed = np.sum([each.alarmed[persistence] for each in counts], axis=0)
     return {"hit_rate": (hits / approaches).tolist(), "stretches_with_alarm": (alarmed / stretches).tolist()}

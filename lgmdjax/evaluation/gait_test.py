@@ -52,7 +52,7 @@ class GaitMetrics:
     pitch: float  # rad, RMS
     roll: float  # rad, RMS
     yaw: float  # rad, RMS about a straight trend
-    bounce: float  # m, RMS of the height
+    heave: float  # m, RMS of the height
 
 
 @partial(jax.jit, static_argnames="steps")
@@ -129,7 +129,7 @@ def measure_gait(trajectory: GaitTrajectory, cycle_time: float) -> GaitMetrics:
         pitch=float(np.std(pitch)),
         roll=float(np.std(roll)),
         yaw=float(np.std(yaw - trend)),
-        bounce=float(np.std(trajectory.position[first:last, 2])),
+        heave=float(np.std(trajectory.position[first:last, 2])),
     )
 
 

@@ -32,7 +32,7 @@ from scipy import ndimage, stats
 
 from lgmdjax import geometry
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.locomotion import cpg
 from lgmdjax.simulation import finite
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
@@ -61,7 +61,7 @@ class Estimate:
 
 
 @struct.dataclass(kw_only=True)
-class Progress(Shown):
+class Progress(NotebookTable):
     """Whether robots make progress: how much floor they cover, and how much they turn; means over robots."""
 
     coverage: Estimate  # 1/min, new cells of `CELL`
@@ -71,7 +71,7 @@ class Progress(Shown):
 
 
 @struct.dataclass(kw_only=True)
-class Score(Shown):
+class Score(NotebookTable):
     """Metrics of a batch of walks with one policy."""
 
     robots: int

@@ -155,7 +155,7 @@ def summarise(trial: trials.Trial, record: Record) -> JsonObject:
         "passing": asdict(outcome.passing()),
         "retreated": int(outcome.retreated.sum()),
         "made_good": asdict(metrics.bootstrap_mean(outcome.made_good)),
-        "progress": asdict(metrics.progress(trials.until_end(record, outcome))),
+        "progress": asdict(metrics.progress(trials.truncate_at_end(record, outcome))),
         "clearance": outcome.clearance.tolist(),
         "seconds": (outcome.frames / FRAME_RATE).tolist(),
     }

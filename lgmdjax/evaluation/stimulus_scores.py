@@ -60,7 +60,7 @@ class DetectorSetup(NamedTuple):
     is_ideal: bool = False
 
 
-class Bench(NamedTuple):
+class StimulusClips(NamedTuple):
     """All clips of a benchmark."""
 
     selection: Clips
@@ -93,10 +93,10 @@ DETECTORS: Mapping[str, DetectorSetup] = {
 """Detectors by name. Their time constants are for 30 frames a second."""
 
 
-def find(name: str) -> DetectorSetup:
+def get_detector(name: str) -> DetectorSetup:
     """Return a detector by its name here, by `module:attribute`, or by `module:` for a module that is a detector.
 
-    >>> find("lgmdjax.detectors:lgmd2").detector.__name__
+    >>> get_detector("lgmdjax.detectors:lgmd2").detector.__name__
     'lgmdjax.detectors.lgmd2'
     """
     if name in DETECTORS:
@@ -109,9 +109,9 @@ def find(name: str) -> DetectorSetup:
     return _published(detector)
 
 
-def make_bench(settings: StimulusBench, seed: int) -> Bench:
+def render_clips(settings: StimulusBench, seed: int) -> StimulusClips:
     """Render all clips."""
-    return Bench(
+    return StimulusClips(
         selection=stimulus_clips.selection(settings),
         timing=stimulus_clips.timing(settings),
         contrast=stimulus_clips.contrast(settings),
@@ -119,20 +119,20 @@ def make_bench(settings: StimulusBench, seed: int) -> Bench:
     )
 
 
-def score(name: str, bench: Bench) -> JsonObject:
+def score(name: str, clips: StimulusClips) -> JsonObject:
     """Run a detector on all clips and return its scores."""
-    setup = find(name)
-    height, width = bench.selection.frames.shape[2:]
+    setup = get_detector(name)
+    height, width = clips.selection.frames.shape[2:]
     params = setup.params(camera.Params(width=width, height=height))
-    u = {part: respond(setup, params, clips) for part, clips in bench._asdict().items()}
+    u = {part: respond(setup, params, some) for part, some in clips._asdict().items()}
     peaks = {part: np.max(response[:, FIRST:], axis=1) for part, response in u.items()}
-    named = dict(zip(bench.selection.names, peaks["selection"].tolist(), strict=True))
+    named = dict(zip(clips.selection.names, peaks["selection"].tolist(), strict=True))
     return {
         "detector": name,
         "is_ideal": setup.is_ideal,
         "peaks": named,
         **compare(named),
-        "timing": time_peaks(u["timing"], bench.timing),
+        "timing": time_peaks(u["timing"], clips.timing),
         "contrast": {"contrasts": list(CONTRASTS), "peaks": peaks["contrast"].tolist()},
         "noise": {
             "sigma": list(NOISE),

@@ -32,7 +32,7 @@ from numpy import ndarray
 from lgmdjax import geometry
 from lgmdjax.evaluation.metrics import Estimate, wilson_proportion
 from lgmdjax.evaluation.settings import TrialName
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.simulation import finite, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena, scenes
@@ -46,14 +46,14 @@ TURN_BACK_ANGLE = 0.5 * np.pi  # rad from the first heading
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial(Shown):
+class Trial(NotebookTable):
     """One trial; `make_rooms(key, seeds)` builds a room for each robot."""
 
     name: TrialName
     title: str
     source: str  # figure or section of the paper
     paper: str  # the paper's result
-    shows: str  # caption of the figure
+    caption: str  # caption of the figure
     make_rooms: Callable[[Array, int], Room]
     seeds: int  # number of repetitions: as many as in the paper, or more
     seconds: float  # longest duration of a walk
@@ -63,7 +63,7 @@ class Trial(Shown):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome(Shown):
+class Outcome(NotebookTable):
     """Outcome of a trial for each robot."""
 
     touched: Bool[ndarray, " robots"]  # touched something, or was lost
@@ -109,7 +109,7 @@ def find_outcome(trial: Trial, record: Record) -> Outcome:
     )
 
 
-def until_end(record: Record, outcome: Outcome) -> Record:
+def truncate_at_end(record: Record, outcome: Outcome) -> Record:
     """Return the walks with `ok` false in the frames after the end of each robot's trial."""
     frames = np.arange(np.shape(record.ok)[1])
     return replace(record, ok=np.asarray(record.ok) & (frames < outcome.frames[:, None]))
@@ -171,7 +171,7 @@ def _gap_trial(name: TrialName, width: float) -> Trial:
         title=f"a gap of {width:g} m",
         source="-",
         paper="not done",
-        shows=f"Two boxes 1.2 m ahead with {width:g} m between them; the robot is 0.4 m wide.",
+        caption=f"Two boxes 1.2 m ahead with {width:g} m between them; the robot is 0.4 m wide.",
         make_rooms=_repeat_scene(lambda key: scenes.gap_scene(width, key), GAP_JITTER),
         seeds=40,
         seconds=60.0,
@@ -187,7 +187,7 @@ TRIALS: dict[str, Trial] = {
             title="the testing room",
             source="fig. 13",
             paper="235.3 m in five trials, no collision",
-            shows="Sixteen obstacles; the robots start at (0, 2.5).",
+            caption="Sixteen obstacles; the robots start at (0, 2.5).",
             make_rooms=lambda key, seeds: room_batches.replicate_room(key, scenes.testing_room(), seeds),
             seeds=5,
             seconds=1080.0,
@@ -198,7 +198,7 @@ TRIALS: dict[str, Trial] = {
             title="held-out random rooms",
             source="-",
             paper="not done",
-            shows="One random room per robot.",
+            caption="One random room per robot.",
             make_rooms=room_batches.random_rooms,
             seeds=64,
             seconds=180.0,
@@ -209,7 +209,7 @@ TRIALS: dict[str, Trial] = {
             title="a single obstacle",
             source="fig. 14",
             paper="15 of 15",
-            shows="A tube 1.25 m ahead, up to 0.42 m to a side, before a white wall; below, the smallest clearance.",
+            caption="A tube 1.25 m ahead, up to 0.42 m to a side, before a white wall; below, the smallest clearance.",
             make_rooms=_tube_rooms,
             seeds=8,
             seconds=90.0,
@@ -221,7 +221,7 @@ TRIALS: dict[str, Trial] = {
             title="indoors",
             source="figs. 15a and 16a",
             paper="12 of 12",
-            shows="A box 1.2 m ahead, another to the right, a table with thin legs to the left (its top dashed).",
+            caption="A box 1.2 m ahead, another to the right, a table with thin legs to the left (its top dashed).",
             make_rooms=_repeat_scene(scenes.indoor_scene),
             seeds=12,
             seconds=90.0,
@@ -232,7 +232,7 @@ TRIALS: dict[str, Trial] = {
             title="outdoors",
             source="fig. 15b",
             paper="10 of 10",
-            shows="Trees with crowns (dashed), bushes and hedges on grass, before a facade.",
+            caption="Trees with crowns (dashed), bushes and hedges on grass, before a facade.",
             make_rooms=_repeat_scene(scenes.outdoor_scene),
             seeds=10,
             seconds=90.0,
@@ -243,7 +243,7 @@ TRIALS: dict[str, Trial] = {
             title="moving obstacles",
             source="figs. 15c, 16b and 16c",
             paper="10 of 10, twice by walking backward",
-            shows="A box moves into the way from the left, then one from the right (dotted).",
+            caption="A box moves into the way from the left, then one from the right (dotted).",
             make_rooms=_repeat_scene(scenes.dynamic_scene),
             seeds=10,
             seconds=90.0,
@@ -257,7 +257,7 @@ TRIALS: dict[str, Trial] = {
             title="a white wall",
             source="sec. 5.4",
             paper="fails",
-            shows="A wall without contrast has no edges but its rims, so a detector of edges can't see it.",
+            caption="A wall without contrast has no edges but its rims, so a detector of edges can't see it.",
             make_rooms=_repeat_scene(_white_wall),
             seeds=12,
             seconds=60.0,
@@ -267,7 +267,7 @@ TRIALS: dict[str, Trial] = {
             title="a corner",
             source="sec. 5.4",
             paper="fails",
-            shows="The robot walks into the corner of two walls, and both eyes see the same.",
+            caption="The robot walks into the corner of two walls, and both eyes see the same.",
             make_rooms=_repeat_scene(_corner),
             seeds=12,
             seconds=90.0,

@@ -236,7 +236,7 @@ def _run_epochs(
         for epoch, progress in steps:
             bar.set_postfix(mse=f"{progress.train[epoch - 1]:.4f}", test=f"{progress.test[epoch - 1]:.4f}")
             bar.update(epoch - done)
-            for number in range(done, epoch) if tracking.is_listening() else ():
+            for number in range(done, epoch) if tracking.has_listener() else ():
                 curves = {"train_mse": progress.train[number], "test_mse": progress.test[number]}
                 tracking.log(number + 1, {f"{name}/{curve}": float(value) for curve, value in curves.items()})
             done = epoch

@@ -62,7 +62,7 @@ class Checkpoints:
             self._require_same_identity(found)
             contents = ocp.args.Composite(progress=ocp.args.StandardRestore(template))  # pyright: ignore
             restored = self.manager.restore(step, args=contents)["progress"]
-            if found.get(checksums.SEAL) not in (None, _digest(restored)):
+            if found.get(checksums.CHECKSUM_KEY) not in (None, _digest(restored)):
                 raise checksums.ChecksumError("another checksum than the saved one")
             if not all(jax.tree.leaves(jax.tree.map(_is_as_finite, initial, restored))):
                 raise checksums.ChecksumError("numbers that are not finite")
@@ -77,7 +77,7 @@ class Checkpoints:
 
     def save(self, step: int, progress: PyTree) -> None:
         """Write progress; it is complete on disk when this returns."""
-        identity = self.identity | {checksums.SEAL: _digest(progress)}
+        identity = self.identity | {checksums.CHECKSUM_KEY: _digest(progress)}
         args = ocp.args.Composite(
             progress=ocp.args.StandardSave(progress),  # pyright: ignore
             belongs=ocp.args.JsonSave(identity),  # pyright: ignore  (the identity's name on disk)

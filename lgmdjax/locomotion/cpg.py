@@ -36,7 +36,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 
 LEGS = 6
 EXTENSOR, FLEXOR = 0, 1
@@ -70,7 +70,7 @@ def coupling(
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Constants of the network (paper sec. 3.2) and the time scale."""
 
     reaction_time: Float[Array, ""] | float = 1.7  # T_r, time units

@@ -119,7 +119,7 @@ def fit(
     def report(done: int, loss: Float[Array, ""]) -> None:
         if progress:
             progress(done, float(loss))
-        if tracking.is_listening():
+        if tracking.has_listener():
             tracking.log(done, {f"{name}/loss_mm2": float(loss)})
 
     demonstrations = _demonstrations(geometry, gait or Gait(), cpg_params or cpg.Params(), printed_input)

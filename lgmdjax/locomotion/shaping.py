@@ -25,7 +25,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.paths import SHAPING_FILE
 from lgmdjax.runtime import schema, storage
 from lgmdjax.runtime.storage import JsonObject
@@ -46,7 +46,7 @@ MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])  # of mirrored joint angles; mirroring
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Weights of the six networks.
 
     The inputs are CPG output, adaptation difference and velocity; the outputs are joint angles in radians.

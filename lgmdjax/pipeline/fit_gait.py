@@ -129,7 +129,7 @@ def _summary(walks: Walks, cycle: float) -> JsonObject:
         "cycle_time": cycle,
         "sweep": rows,
         "literal": {simulator: gait.speed for simulator, gait in printed.items()},
-        "sway": sway | {"bounce_mm": 1000 * straight.bounce},
+        "sway": sway | {"bounce_mm": 1000 * straight.heave},
     }
 
 

@@ -99,9 +99,9 @@ def page_of(playback: Playback, *, follow: bool = False) -> WalkPage:
     try:
         scene = WalkScene(server)
         scene.follows = follow
-        scene.enter(playback.room, playback.centres_at(0))
+        scene.set_room(playback.room, playback.centres_at(0))
         scene.trace(playback)
-        scene.look(playback.room)
+        scene.point_camera(playback.room)
         recording = server.get_scene_serializer()
         for frame in range(0, len(playback.time), STRIDE):
             scene.show(playback.qpos[frame], playback.centres_at(frame))

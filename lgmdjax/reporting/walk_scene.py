@@ -82,7 +82,7 @@ class WalkScene:
         self._offset = np.zeros(3)
         self._qpos = self.model.key("stance").qpos.copy()
 
-    def enter(self, room: RoomShape, centres: Float[ndarray, "n 2"]) -> None:
+    def set_room(self, room: RoomShape, centres: Float[ndarray, "n 2"]) -> None:
         """Replace the room by another one."""
         for name in ("walls", "floor", "obstacles", "paths", "contacts"):
             self.server.scene.remove_by_name(f"{WORLD}/{name}")
@@ -137,7 +137,7 @@ class WalkScene:
         x, y, _ = start + (height - start[2]) / along[2] * along
         return float(x), float(y)
 
-    def look(self, room: RoomShape) -> None:
+    def point_camera(self, room: RoomShape) -> None:
         """Point the initial camera at the robot, or at the whole room if the robot is not followed."""
         x_min, x_max, y_min, y_max = room.bounds
         camera = self.server.initial_camera
@@ -202,7 +202,7 @@ class WalkScene:
         )
         self._obstacles[index] = handle
 
-    def let_drag(self, on_move: Callable[[int, float, float], None]) -> None:
+    def enable_drag(self, on_move: Callable[[int, float, float], None]) -> None:
         """Call `on_move` with an obstacle's number and its new position [m] while the user drags it."""
         for index, handle in self._obstacles.items():
 

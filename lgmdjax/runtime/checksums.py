@@ -4,7 +4,7 @@
 | ---------------------------- | --------------------------------------------------------------------------------- |
 | a file of a finished stage   | in the `files` of the stage's done.json                                           |
 | a file of lgmdjax/data       | in lgmdjax/data/done.json, which the experiments that train the weights write     |
-| done.json, run.json          | in themselves (`seal`)                                                            |
+| done.json, run.json          | in themselves (`add_checksum`)                                                    |
 | safetensors, Parquet         | in their own headers too, so that a copy elsewhere is checked                     |
 | a checkpoint                 | stored with the identity of its fit (`lgmdjax.learning.checkpoints`)              |
 | a cached program             | at the end of its file (`program_cache`), on its first line (`export_cache`)      |
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 STAMP = "done.json"
-SEAL = "sha256"  # name of a document's own checksum
+CHECKSUM_KEY = "sha256"  # name of a document's own checksum
 PARTIAL = ".partial"  # in the names of unfinished files and folders
 UNFINISHED = (PARTIAL, ".part")  # suffixes of unfinished files; version 0.1.0 wrote .part
 MAX_DEPTH = 3  # folders from a file up to the one whose done.json lists it
@@ -41,23 +41,24 @@ def digest(*parts: bytes) -> str:
     return total.hexdigest()
 
 
-def seal(content: Mapping[str, object]) -> dict[str, Any]:
+def add_checksum(content: Mapping[str, object]) -> dict[str, Any]:
     """Return a JSON object with its own checksum.
 
-    >>> is_sealed(seal({"seed": 1})), is_sealed(seal({"seed": 1}) | {"seed": 2}), is_sealed({"seed": 1})
+    >>> content = add_checksum({"seed": 1})
+    >>> has_valid_checksum(content), has_valid_checksum(content | {"seed": 2}), has_valid_checksum({"seed": 1})
     (True, False, False)
     """
-    return {**content, SEAL: _digest_json(content)}
+    return {**content, CHECKSUM_KEY: _digest_json(content)}
 
 
-def is_sealed(content: object) -> bool:
+def has_valid_checksum(content: object) -> bool:
     """Tell whether a JSON value is an object with its own checksum, and has not changed since."""
-    return isinstance(content, Mapping) and SEAL in content and content[SEAL] == _digest_json(content)
+    return isinstance(content, Mapping) and CHECKSUM_KEY in content and content[CHECKSUM_KEY] == _digest_json(content)
 
 
-def require_seal(content: object) -> None:
+def require_checksum(content: object) -> None:
     """Raise `ChecksumError` for a JSON object whose checksum is not that of its contents."""
-    if isinstance(content, Mapping) and SEAL in content and not is_sealed(content):
+    if isinstance(content, Mapping) and CHECKSUM_KEY in content and not has_valid_checksum(content):
         raise ChecksumError("its checksum is not that of its contents")
 
 
@@ -97,13 +98,13 @@ def read_stamp(folder: Path) -> Stamp:
     files = facts.get("files", {}) if isinstance(facts, dict) else None
     if not isinstance(files, dict):
         raise ChecksumError(f"{folder / STAMP} lists no files")
-    is_older = SEAL not in facts and not any(isinstance(value, str) for value in files.values())
-    if not (is_older or is_sealed(facts)):
+    is_older = CHECKSUM_KEY not in facts and not any(isinstance(value, str) for value in files.values())
+    if not (is_older or has_valid_checksum(facts)):
         raise ChecksumError(f"the checksum of {folder / STAMP} is not that of its contents")
     return Stamp(facts, None if is_older else files)
 
 
 def _digest_json(content: Mapping[str, object]) -> str:
     """Return the checksum of a JSON object except its own checksum; the order of its keys has no effect."""
-    rest = {key: value for key, value in content.items() if key != SEAL}
+    rest = {key: value for key, value in content.items() if key != CHECKSUM_KEY}
     return digest(json.dumps(rest, sort_keys=True).encode())

@@ -9,10 +9,10 @@ from pathlib import Path
 import jax
 
 MAPS_FILE, LIMIT_FILE = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-CROWDED_FRACTION = 0.2  # leaves room for four times as much before the next call
+MAX_MAPPINGS_FRACTION = 0.2  # leaves room for four times as much before the next call
 
 
-def clear_caches_if_crowded(fraction: float = CROWDED_FRACTION) -> None:
+def clear_caches_if_near_limit(fraction: float = MAX_MAPPINGS_FRACTION) -> None:
     """Clear JAX's caches in memory if this process uses more than a fraction of the mappings that Linux allows it.
 
     Do nothing on systems without such a limit. Cleared programs are compiled again, or read from JAX's cache on disk,

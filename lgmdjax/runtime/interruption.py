@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 GRACE = 1.5  # s from a signal to the end of the process
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows lacks the last
 
-_received: list[int] = []  # signals since the last `obeying` began
+_received: list[int] = []  # signals since the last `handling_signals` began
 
 
 class Interrupted(KeyboardInterrupt):
@@ -35,7 +35,7 @@ def check() -> None:
 
 
 @contextlib.contextmanager
-def obeying(message: str) -> Iterator[None]:
+def handling_signals(message: str) -> Iterator[None]:
     """Raise `Interrupted` for signals inside the block; print a message if the process has to be ended at once.
 
     Signals that the process ignores, as under `nohup`, stay ignored. Outside the main thread this does nothing, since
@@ -69,7 +69,7 @@ def obeying(message: str) -> Iterator[None]:
 def counting() -> Iterator[Callable[[], int]]:
     """Count signals instead of ending the command, for code that must finish; yield a function that returns the count.
 
-    For code inside `obeying`, in the main thread. Signals that the process ignores stay ignored.
+    For code inside `handling_signals`, in the main thread. Signals that the process ignores stay ignored.
     """
     received: list[int] = []
     numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]

@@ -84,7 +84,7 @@ def open_run(
         run.folder.mkdir(parents=True, exist_ok=True)
         if not (run.folder / "run.json").exists():
             with _locked(run):
-                facts = checksums.seal(requested | {"versions": versions.installed()})
+                facts = checksums.add_checksum(requested | {"versions": versions.installed()})
                 storage.write_json(run.folder / "run.json", facts)
         _check_same(run, requested)
         (run.folder / ".lock").touch()
@@ -171,7 +171,7 @@ def _adopt_stamp(folder: Path) -> None:
     """Rename a complete done.json whose process was killed before it could rename it."""
     for written in folder.glob(f"{checksums.STAMP}.*{checksums.PARTIAL}"):
         with contextlib.suppress(OSError, ValueError, RecursionError):
-            if checksums.is_sealed(json.loads(written.read_bytes())):
+            if checksums.has_valid_checksum(json.loads(written.read_bytes())):
                 os.replace(written, folder / checksums.STAMP)
 
 
@@ -183,7 +183,7 @@ def _run_in(folder: Path, run: Run, stage: Stage, stage_fingerprint: str) -> flo
     inputs = {name: run.folder / name for name in stage.inputs}
     stage.run(folder, inputs, run.settings[stage.name], run.seed)
     seconds = time.perf_counter() - start
-    compiled_code.clear_caches_if_crowded()
+    compiled_code.clear_caches_if_near_limit()
     facts = {"fingerprint": stage_fingerprint, "seconds": round(seconds, 1), "versions": versions.installed()}
     storage.write_stamp(folder, facts | {"device": describe_devices()})
     return seconds

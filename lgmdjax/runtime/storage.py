@@ -55,7 +55,7 @@ def write_stamp(folder: Path, facts: JsonObject) -> None:
     for path in sorted(folder.rglob("*")):
         sync(path)
     sync(folder)
-    write_json(folder / checksums.STAMP, checksums.seal({**facts, "files": checksums.list_files(folder)}))
+    write_json(folder / checksums.STAMP, checksums.add_checksum({**facts, "files": checksums.list_files(folder)}))
 
 
 def read_file(path: Path) -> bytes:
@@ -68,7 +68,7 @@ def read_json(path: Path) -> Any:
     """Read a JSON file of a run folder; raise `InputError` for a missing or damaged one."""
     with _naming_command(path):
         content = json.loads(checksums.read_bytes(path))
-        checksums.require_seal(content)
+        checksums.require_checksum(content)
         return content
 
 
@@ -164,7 +164,7 @@ def save_tensors(
         raise InputError(f"{path}: expected finite weights to save, got some that are not; train again")
     header = {"format": kind.format, "version": kind.version}
     header |= {name: json.dumps(value) for name, value in metadata.items()}
-    header[checksums.SEAL] = json.dumps(_digest_tensors(tensors, header))
+    header[checksums.CHECKSUM_KEY] = json.dumps(_digest_tensors(tensors, header))
     try:
         with replacing(path) as partial:
             partial.write_bytes(serialise(dict(tensors), header))
@@ -189,7 +189,7 @@ def load_tensors(path: Path | str, kind: TensorFile) -> tuple[dict[str, np.ndarr
                 raise InputError(f"{path}: expected version {kind.version}, got {header.get('version')}; {remedy}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         metadata = {name: json.loads(text) for name, text in header.items() if name not in ("format", "version")}
-        if metadata.pop(checksums.SEAL, None) not in (None, _digest_tensors(tensors, header)):
+        if metadata.pop(checksums.CHECKSUM_KEY, None) not in (None, _digest_tensors(tensors, header)):
             raise checksums.ChecksumError("a file with another checksum in its header")
     except InputError:
         raise
@@ -204,7 +204,7 @@ def load_tensors(path: Path | str, kind: TensorFile) -> tuple[dict[str, np.ndarr
 def _digest_tensors(tensors: Mapping[str, np.ndarray], header: Mapping[str, str]) -> str:
     """Return the checksum of arrays and of a header, except the header's own checksum."""
     arrays = [(name, str(array.dtype), array.shape, array.tobytes()) for name, array in sorted(tensors.items())]
-    rest = sorted((name, text) for name, text in header.items() if name != checksums.SEAL)
+    rest = sorted((name, text) for name, text in header.items() if name != checksums.CHECKSUM_KEY)
     return checksums.digest(repr((rest, arrays)).encode())
 
 

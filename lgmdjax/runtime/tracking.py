@@ -1,7 +1,7 @@
 """Curves of fits while they run: every fit calls `log(step, values)`, which passes the values to all listeners.
 
 >>> seen = []
->>> with listening(lambda step, values: seen.append((step, dict(values)))):
+>>> with add_listener(lambda step, values: seen.append((step, dict(values)))):
 ...     log(100, {"fit/loss": 0.5})
 >>> log(200, {"fit/loss": 0.25})  # nobody listens
 >>> seen
@@ -23,7 +23,7 @@ _listeners: ContextVar[tuple[Log, ...]] = ContextVar("listeners", default=())
 
 
 @contextlib.contextmanager
-def listening(to: Log) -> Iterator[None]:
+def add_listener(to: Log) -> Iterator[None]:
     """Pass what fits log inside the block to `to`, in addition to earlier listeners."""
     token = _listeners.set((*_listeners.get(), to))
     try:
@@ -32,7 +32,7 @@ def listening(to: Log) -> Iterator[None]:
         _listeners.reset(token)
 
 
-def is_listening() -> bool:
+def has_listener() -> bool:
     """Return whether there is a listener; without one, a fit need not fetch values from its device."""
     return bool(_listeners.get())
 

@@ -28,7 +28,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.sensors import antialiasing, compositing, hemifield, silhouettes
 from lgmdjax.sensors.fusion import materialise
 from lgmdjax.sensors.settings import check_field
@@ -48,7 +48,7 @@ MAX_SIZE = 4096
 
 
 @struct.dataclass(kw_only=True, frozen=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Structure of the camera, all of it static. Raises InputError for impossible values.
 
     >>> image_shape(Params(width=80, height=60, overlap=0.5))

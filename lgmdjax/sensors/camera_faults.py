@@ -16,8 +16,8 @@ rounded. All numbers are arrays, so that `vmap` gives each robot of a batch its 
 | gamma  | gamma of the sensor                             | 1         | 255 (L/255)^gamma                            |
 | q      | quality of JPEG                                 | 1..100    | steps of ITU-T T.81, scaled as libjpeg does  |
 
-Errors of lens and pose are not operations on a picture, because the picture lacks what they bring into view. `Lens` is
-for code that casts the rays; `warp` approximates the distortion on a picture.
+Errors of lens and pose are not operations on a picture, because the picture lacks what they bring into view.
+`LensError` is for code that casts the rays; `warp` approximates the distortion on a picture.
 """
 
 from typing import NamedTuple
@@ -50,7 +50,7 @@ LUMINANCE = np.array(
 
 
 @struct.dataclass(kw_only=True)
-class Lens:
+class LensError:
     """How the eyes differ from the calibration: focal length towards the edge, and pose."""
 
     distortion: Float[Array, ""] | float = 0.0  # at the left and right edge, as a part of the distance from the middle
@@ -64,7 +64,7 @@ class Params:
 
     vignetting: Float[Array, ""] | float = 0.0  # c
     blur: Float[Array, ""] | float = 0.0  # s
-    adapts: Float[Array, ""] | float = 0.0  # 1: the exposure adapts to the picture
+    auto_exposure: Float[Array, ""] | float = 0.0  # 1: the exposure adapts to the picture
     drift: Float[Array, ""] | float = 0.0  # standard deviation of the drift of g
     noise: Float[Array, ""] | float = 0.0  # 1: there is noise
     electrons: Float[Array, ""] | float = 20.0  # e; a full well of 5,100 electrons
@@ -81,7 +81,7 @@ class State:
 
     previous: Float[Array, "2 height width"]
     gain: Float[Array, ""]  # g
-    aim: Float[Array, ""]  # a, which drifts
+    exposure_target: Float[Array, ""]  # a, which drifts
     waiting: Float[Array, "late 2 height width"]  # pictures, the latest first
     arrives: Bool[Array, " late"]  # those that were not dropped
     key: Array
@@ -100,7 +100,7 @@ def init(params: Params, pictures: Float[Array, "2 height width"], key: Array) -
     return State(
         previous=pictures,
         gain=jnp.zeros((), pictures.dtype),
-        aim=jnp.zeros((), pictures.dtype),
+        exposure_target=jnp.zeros((), pictures.dtype),
         waiting=jnp.broadcast_to(pictures, (late, *pictures.shape)),
         arrives=jnp.zeros(late, bool),
         key=key,
@@ -119,15 +119,17 @@ def step(params: Params, state: State, pictures: Float[Array, "2 height width"])
     """
     key, noise_key, drift_key, drop_key = jax.random.split(state.key, 4)
     light = expose(params, state, pictures)
-    aim, gain = adapt(params, state, light, drift_key)
-    light = jnp.exp(params.adapts * gain) * light
+    exposure_target, gain = adapt(params, state, light, drift_key)
+    light = jnp.exp(params.auto_exposure * gain) * light
     light = light + params.noise * _noise(params, light, noise_key)
     grey = _round(clip(apply_gamma(light, params.gamma), 0.0, 255.0))
     grey = jnp.where(jnp.asarray(params.quality) > 0, compress(grey, jnp.maximum(params.quality, 1.0)), grey)
     kept = ~jax.random.bernoulli(drop_key, params.dropped)
     waiting = jnp.concatenate([grey[None], state.waiting[:-1]])
     arrives = jnp.concatenate([kept[None], state.arrives[:-1]])
-    after = State(previous=pictures, gain=gain, aim=aim, waiting=waiting, arrives=arrives, key=key)
+    after = State(
+        previous=pictures, gain=gain, exposure_target=exposure_target, waiting=waiting, arrives=arrives, key=key
+    )
     return after, Delivery(jnp.take(waiting, params.latency, axis=0), jnp.take(arrives, params.latency))
 
 
@@ -144,9 +146,9 @@ def adapt(params: Params, state: State, light: Array, key: Array) -> tuple[Array
     """Return a and g after a picture: g follows the picture's mean with a lag, and a is a slow Gaussian process."""
     keep = 1.0 - 1.0 / DRIFT_TIME
     jump = params.drift * jnp.sqrt(1.0 - keep * keep) * jax.random.normal(key, (), light.dtype)
-    aim = keep * state.aim + jump
-    wanted = aim - jnp.log(jnp.maximum(jnp.mean(light), 1.0) / MEAN_GREY)
-    return aim, state.gain + EXPOSURE_RATE * (wanted - state.gain)
+    exposure_target = keep * state.exposure_target + jump
+    wanted = exposure_target - jnp.log(jnp.maximum(jnp.mean(light), 1.0) / MEAN_GREY)
+    return exposure_target, state.gain + EXPOSURE_RATE * (wanted - state.gain)
 
 
 def _noise(params: Params, light: Array, key: Array) -> Array:

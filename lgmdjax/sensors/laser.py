@@ -28,14 +28,14 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.minmax import amin, maximum, minimum
 from lgmdjax.world import raycast
 from lgmdjax.world.arena import Arena
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Number of rays, field of view [rad] and largest range [m] of the scanner (sec. 3.1), and the corridor (ours)."""
 
     rays: int = struct.field(pytree_node=False, default=341)

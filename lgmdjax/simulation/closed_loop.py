@@ -29,7 +29,7 @@ from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, controller
 from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.sensors import camera, laser
@@ -47,7 +47,7 @@ SUBSTEPS = 6  # physics steps a frame; the time step in the robot's XML is 1 / (
 
 
 @struct.dataclass(kw_only=True)
-class Params(Shown):
+class Params(NotebookTable):
     """Parameters of a robot, except its body: controller, teacher, and sensors."""
 
     controller: controller.Params
@@ -59,7 +59,7 @@ class Params(Shown):
 
 
 @struct.dataclass(kw_only=True)
-class Room(Shown):
+class Room(NotebookTable):
     """A room with the poses (x, y, yaw) at which its robot starts, in order."""
 
     arena: arena.Arena
@@ -86,7 +86,7 @@ class State:
 
 
 @struct.dataclass(kw_only=True)
-class Record(Shown):
+class Record(NotebookTable):
     """The record of one frame, or of many: `axes` are then (frame) or (robot, frame).
 
     The pose is that from which the pictures were rendered. Records on the host hold NumPy arrays.

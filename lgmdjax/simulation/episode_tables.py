@@ -133,7 +133,7 @@ def check(table: pa.Table, path: Path) -> pa.Table:
 
 def digest(table: pa.Table, header: JsonObject) -> str:
     """Return the checksum of a table and of its header, except the header's own checksum."""
-    rest = {name: value for name, value in header.items() if name != checksums.SEAL}
+    rest = {name: value for name, value in header.items() if name != checksums.CHECKSUM_KEY}
     columns = [(name, str(table[name].type), table[name].to_numpy().tobytes()) for name in table.column_names]
     return checksums.digest(repr((json.dumps(rest, sort_keys=True), columns)).encode())
 

@@ -57,7 +57,7 @@ NEAREST_ONLY = (1, 2)
 
 HEADER = schema.Object(
     {"format": schema.Text((FORMAT,)), "parameters": schema.Object()},
-    {checksums.SEAL: schema.Text(), "units": schema.Object(), "versions": schema.Object()},
+    {checksums.CHECKSUM_KEY: schema.Text(), "units": schema.Object(), "versions": schema.Object()},
 )
 """Schema of the header of a chunk, without its version."""
 
@@ -130,7 +130,7 @@ class Writer:
             "versions": versions.installed(),
         }
         return {
-            "lgmdjax": json.dumps(header | {checksums.SEAL: episode_tables.digest(table, header)}),
+            "lgmdjax": json.dumps(header | {checksums.CHECKSUM_KEY: episode_tables.digest(table, header)}),
             **episode_tables.pandas_attributes(),
         }
 
@@ -251,7 +251,7 @@ def _load(path: Path) -> tuple[JsonObject, pa.Table]:
             if file.metadata.num_rows > episode_tables.MAX_ROWS:  # before memory is allocated
                 raise checksums.ChecksumError(f"{file.metadata.num_rows} rows")
             table = file.read()
-        if header.get(checksums.SEAL) not in (None, episode_tables.digest(table, header)):
+        if header.get(checksums.CHECKSUM_KEY) not in (None, episode_tables.digest(table, header)):
             raise checksums.ChecksumError("another checksum in its header")
     except InputError:
         raise

@@ -53,7 +53,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: ErrataSettings, seed
     rows = []
     for name, change in CASES.items():
         rows.append(_measure(folder, name, change(robot, folder), settings, seed))
-        compiled_code.clear_caches_if_crowded()  # nearly every case has its own programs
+        compiled_code.clear_caches_if_near_limit()  # nearly every case has its own programs
     storage.write_json(folder / "errata.json", rows)
 
 

@@ -100,7 +100,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: SensitivitySettings,
         for changed in same:
             facts = {"parameter": changed.parameter, "value": changed.value}
             rows.append(_score(folder, changed.robot, settings.benchmark, seed, facts, contrast=changed.contrast))
-        compiled_code.clear_caches_if_crowded()  # each camera has its own programs
+        compiled_code.clear_caches_if_near_limit()  # each camera has its own programs
     rows += _score_learners(folder, robot, recorded, settings, seed)
     chosen = baseline(robot)
     rows = [row | {"is_baseline": row["value"] == chosen.get(row["parameter"])} for row in rows]
@@ -119,7 +119,7 @@ def _score_learners(
             learner = assembly.with_policy(robot, "learned", _fit(checkpoints, walks, epochs, seed + repeat))
             facts = {"parameter": parameter, "value": value, "repeat": repeat}
             yield _score(folder, learner, settings.benchmark, seed, facts)
-        compiled_code.clear_caches_if_crowded()  # each amount of data has its own programs
+        compiled_code.clear_caches_if_near_limit()  # each amount of data has its own programs
 
 
 def baseline(robot: closed_loop.Params) -> dict[str, float]:

@@ -72,7 +72,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: SupervisionSettings,
             facts = {"rule": case.rule, "variant": case.variant, "repeat": repeat}
             walks = case_folder / "benchmark"
             rows.append(_score(walks, learner, settings, policies.LEARNED, seed, facts=facts))
-        compiled_code.clear_caches_if_crowded()  # the fits and rollouts of one seed are two dozen programs
+        compiled_code.clear_caches_if_near_limit()  # the fits and rollouts of one seed are two dozen programs
     storage.write_json(folder / "supervision.json", rows)
 
 

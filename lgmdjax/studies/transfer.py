@@ -44,7 +44,7 @@ COMPARED: tuple[PolicyName, ...] = ("learned", "teacher", "blind")
 BATCH = 8  # robots that are simulated at once and written to one file
 
 
-class Row(NamedTuple):
+class Case(NamedTuple):
     """A world with its faults, a trial and a policy."""
 
     world: str
@@ -55,48 +55,48 @@ class Row(NamedTuple):
 
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: TransferSettings, seed: int) -> None:
-    """Record the walks of every row, and score them."""
+    """Record the walks of every case, and score them."""
     robot = assembly.load_robot(inputs["fit-gait"], inputs["train"])
     rows = []
-    for row in plan(settings):
-        record = _record(folder, robot, row, settings.size(), seed)
-        summary = run_trial.summarise(trials.TRIALS[row.trial], record)
-        rows.append({"world": row.world, "trial": row.trial, "policy": row.policy} | summary)
+    for case in plan(settings):
+        record = _record(folder, robot, case, settings.size(), seed)
+        summary = run_trial.summarise(trials.TRIALS[case.trial], record)
+        rows.append({"world": case.world, "trial": case.trial, "policy": case.policy} | summary)
         storage.write_json(folder / "transfer.json", rows)
 
 
-def plan(settings: TransferSettings) -> Iterator[Row]:
-    """Yield the rows of the study, the most informative ones first."""
+def plan(settings: TransferSettings) -> Iterator[Case]:
+    """Yield the cases of the study, the most informative ones first."""
     other = Style()
     for trial in (UNSEEN, *settings.scenes):
         for policy in COMPARED:
-            yield Row(OWN, trial, policy, None)
-            yield Row(OTHER, trial, policy, other)
-    yield Row(PRISMS, UNSEEN, "learned", replace(other, shapes=False))
+            yield Case(OWN, trial, policy, None)
+            yield Case(OTHER, trial, policy, other)
+    yield Case(PRISMS, UNSEEN, "learned", replace(other, shapes=False))
     for policy in COMPARED if settings.faults else ():
-        yield Row(TOGETHER, UNSEEN, policy, other, settings.faults)
+        yield Case(TOGETHER, UNSEEN, policy, other, settings.faults)
     for name in settings.faults:
-        yield Row(name, UNSEEN, "learned", other, (name,))
+        yield Case(name, UNSEEN, "learned", other, (name,))
 
 
-def _record(folder: Path, robot: closed_loop.Params, row: Row, size: TransferSize, seed: int) -> closed_loop.Record:
-    """Record the walks of a row, or read them if they are on disk."""
-    count, seconds = (size.robots, size.seconds) if row.trial == UNSEEN else (size.seeds, size.scene_seconds)
-    rooms = trials.sample_rooms(row.trial, count, seed)
+def _record(folder: Path, robot: closed_loop.Params, case: Case, size: TransferSize, seed: int) -> closed_loop.Record:
+    """Record the walks of a case, or read them if they are on disk."""
+    count, seconds = (size.robots, size.seconds) if case.trial == UNSEEN else (size.seeds, size.scene_seconds)
+    rooms = trials.sample_rooms(case.trial, count, seed)
     facts = {
-        "trial": row.trial, "policy": row.policy, "seconds": seconds, "robots": count, "faults": list(row.faults),
-        "style": asdict(row.style) if row.style else None, "robot": assembly.fingerprint(robot),
+        "trial": case.trial, "policy": case.policy, "seconds": seconds, "robots": count, "faults": list(case.faults),
+        "style": asdict(case.style) if case.style else None, "robot": assembly.fingerprint(robot),
     }  # fmt: skip
-    place, label = folder / f"{row.world}-{row.trial}-{row.policy}", f"{row.world}, {row.trial}, {row.policy}"
-    if row.style is None:
-        policy = policies.get_policy(row.policy)
+    place, label = folder / f"{case.world}-{case.trial}-{case.policy}", f"{case.world}, {case.trial}, {case.policy}"
+    if case.style is None:
+        policy = policies.get_policy(case.policy)
         return recording.record_rollouts(place, robot, rooms, seconds, policy, seed=seed, parameters=facts, label=label)
     writer = episodes.Writer(place, facts)
     for first in range(writer.chunks * BATCH, count, BATCH):
         present = list(range(first, min(first + BATCH, count)))
         some = jax.tree.map(lambda leaf, present=present: leaf[np.asarray(present)], rooms)
-        world = walk.World(style=row.style, faults=row.faults, seed=seed + first)
-        record = walk.walk(robot, some, seconds, row.policy, world, label=f"{label}, {first + 1} to {present[-1] + 1}")
+        world = walk.World(style=case.style, faults=case.faults, seed=seed + first)
+        record = walk.walk(robot, some, seconds, case.policy, world, label=f"{label}, {first + 1} to {present[-1] + 1}")
         writer.write(record, episode=writer.chunks, rooms=present, seed=seed)
     return episodes.stack_walks(episodes.read(place))
 

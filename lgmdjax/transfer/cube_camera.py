@@ -69,7 +69,7 @@ class CubeCamera:
     Args:
         model: from `robot_model.build`, with the same `face`.
         params: parameters of the fisheye camera.
-        lens: distortion and turn of the eyes (`camera_faults.Lens`).
+        lens: distortion and turn of the eyes (`camera_faults.LensError`).
         whole: render the whole picture, not only the detectors' hemifields.
         face: width of a face [px].
     """
@@ -79,7 +79,7 @@ class CubeCamera:
         model: mujoco.MjModel,
         params: camera.Params,
         *,
-        lens: camera_faults.Lens | None = None,
+        lens: camera_faults.LensError | None = None,
         whole: bool = False,
         face: int = FACE,
     ):
@@ -124,7 +124,7 @@ def resampling(
     params: camera.Params,
     side: int,
     *,
-    lens: camera_faults.Lens | None = None,
+    lens: camera_faults.LensError | None = None,
     whole: bool = False,
     face: int = FACE,
 ) -> dict[str, sparse.csr_matrix]:

@@ -41,9 +41,9 @@ class Faults:
     """All differences from the calibrated robot."""
 
     camera: camera_faults.Params = struct.field(default_factory=camera_faults.Params)
-    lens: camera_faults.Lens = struct.field(default_factory=camera_faults.Lens)
+    lens: camera_faults.LensError = struct.field(default_factory=camera_faults.LensError)
     servos: servo_faults.Params = struct.field(default_factory=servo_faults.Params)
-    body: servo_faults.Body = struct.field(default_factory=servo_faults.Body)
+    body: servo_faults.BodyFaults = struct.field(default_factory=servo_faults.BodyFaults)
     rate: float = struct.field(pytree_node=False, default=FRAME_RATE)  # Hz, of the camera
 
 
@@ -53,7 +53,7 @@ def _noise(faults: Faults, key: Array) -> Faults:
 
 def _exposure(faults: Faults, key: Array) -> Faults:
     gamma = jnp.exp(_uniform(key, jnp.log(0.7), jnp.log(1.4)))
-    return replace(faults, camera=replace(faults.camera, gamma=gamma, adapts=1.0, drift=0.2))
+    return replace(faults, camera=replace(faults.camera, gamma=gamma, auto_exposure=1.0, drift=0.2))
 
 
 def _vignetting(faults: Faults, key: Array) -> Faults:

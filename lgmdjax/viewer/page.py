@@ -67,9 +67,9 @@ class Viewer:
         """Show a recorded walk from its beginning."""
         self.is_live, self.playback, self.playing.frame = False, playback, 0.0
         self.names, self.index = names, index
-        self.scene.enter(playback.room, playback.centres_at(0))
+        self.scene.set_room(playback.room, playback.centres_at(0))
         self.scene.trace(playback)
-        self.scene.look(playback.room)
+        self.scene.point_camera(playback.room)
         self.transport.enter(playback, names, index)
         self.transport.folder.visible = True
         self.live_panel.leave()
@@ -261,9 +261,9 @@ class Viewer:
     def _enter(self, entered: Entered) -> None:
         self.is_live, self.contacts, self.keeps = True, 0, False
         self.transport.folder.visible = False
-        self.scene.enter(entered.shape, entered.centres)
-        self.scene.let_drag(lambda index, x, y: self.simulator.send(Move(index, x, y)))
-        self.scene.look(entered.shape)
+        self.scene.set_room(entered.shape, entered.centres)
+        self.scene.enable_drag(lambda index, x, y: self.simulator.send(Move(index, x, y)))
+        self.scene.point_camera(entered.shape)
         self.live_panel.enter(entered.constants)
 
     def _show_live(self, frame: LiveFrame) -> None:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from lgmdjax.errors import InputError
-from lgmdjax.html import Shown
+from lgmdjax.html import NotebookTable
 from lgmdjax.world import floor_plan
 from lgmdjax.world.obstacles import (
     CAPACITY,
@@ -68,7 +68,7 @@ PICTURES = 4  # rooms of a batch that notebooks show
 
 
 @struct.dataclass(kw_only=True)
-class Arena(Shown):
+class Arena(NotebookTable):
     """A room: obstacles, four walls that are visible from inside, a floor, and a uniform sky (or ceiling)."""
 
     boxes: Prisms

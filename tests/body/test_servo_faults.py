@@ -48,7 +48,7 @@ def test_backlash_is_a_play():
 
 
 def test_the_faulty_body_is_heavier_weaker_and_slips():
-    body = servo_faults.Body(gain=jnp.full((6, 3), 0.9), friction=0.5, payload=0.3)
+    body = servo_faults.BodyFaults(gain=jnp.full((6, 3), 0.9), friction=0.5, payload=0.3)
     model = hexapod.load()
     faulty = servo_faults.apply_to_model(model, body)
     assert faulty.body_subtreemass[0] == pytest.approx(model.body_subtreemass[0] + 0.3)

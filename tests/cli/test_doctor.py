@@ -21,7 +21,7 @@ def test_no_check_fails_on_this_machine(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_jax_computes_the_canary_program_correctly() -> None:
-    assert doctor.arithmetic().level == doctor.OK
+    assert doctor.check_arithmetic().level == doctor.OK
 
 
 def test_a_miscompiled_program_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,7 +29,7 @@ def test_a_miscompiled_program_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
         return lambda rows: np.where(np.arange(len(rows)) % 2, np.sum(rows**2, axis=1), 0.0)
 
     monkeypatch.setattr(jax, "jit", skip_rows)
-    finding = doctor.arithmetic()
+    finding = doctor.check_arithmetic()
     assert finding.level == doctor.FAIL
     assert "16385 of 32769 results wrong" in finding.text
 
@@ -47,7 +47,7 @@ def test_versions_out_of_range_are_reported(
     monkeypatch: pytest.MonkeyPatch, required: list[str], level: str, words: str
 ) -> None:
     monkeypatch.setattr(doctor, "requires", lambda name: required)
-    finding = doctor.packages()
+    finding = doctor.check_packages()
     assert finding.level == level
     assert words in finding.text
 
@@ -55,7 +55,7 @@ def test_versions_out_of_range_are_reported(
 def test_different_versions_of_mujoco_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "requires", lambda name: [])
     monkeypatch.setattr(doctor, "version", lambda name: {"mujoco": "3.18.0"}.get(name, "3.17.0"))
-    assert doctor.packages().level == doctor.FAIL
+    assert doctor.check_packages().level == doctor.FAIL
 
 
 def test_a_failing_check_is_one_line_and_exit_code_1(
@@ -81,17 +81,17 @@ def test_physics_that_cannot_be_imported_is_one_line(
 
 def test_a_folder_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert doctor.folder(tmp_path / "new" / "folder").level == doctor.OK
+    assert doctor.check_folder(tmp_path / "new" / "folder").level == doctor.OK
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
     for path in (tmp_path / "file", tmp_path / "file" / "inside", Path("/proc/nowhere")):
-        assert doctor.folder(path).level == doctor.FAIL
+        assert doctor.check_folder(path).level == doctor.FAIL
 
 
 def test_a_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for enough, minimum, level in ((0.0, 0.0, doctor.OK), (1e9, 0.0, doctor.WARN), (1e9, 1e9, doctor.FAIL)):
         monkeypatch.setattr(doctor, "ENOUGH_GB", enough)
         monkeypatch.setattr(doctor, "MIN_GB", minimum)
-        assert doctor.disk(tmp_path).level == level
+        assert doctor.check_disk(tmp_path).level == level
 
 
 def test_variables_are_named(

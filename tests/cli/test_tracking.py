@@ -74,5 +74,5 @@ def test_what_leads_nowhere_is_one_line(
 
 def test_a_function_that_raises_is_one_line(tmp_path: Path) -> None:
     words = r"expected operator:add to take step 5, got TypeError: .*leave --track out"
-    with pytest.raises(InputError, match=words), tracking.following("operator:add", tmp_path):
+    with pytest.raises(InputError, match=words), tracking.log_to("operator:add", tmp_path):
         log(5, {"fit/loss": 1.0})

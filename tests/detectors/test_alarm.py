@@ -18,8 +18,8 @@ SHAPE = (FRAMES, clips.CAMERA.height, clips.CAMERA.width)  # one for all tests, 
 
 @jax.jit
 def _scan(params, frames, excitation):
-    views = alarm.View(frame=frames[1:], excitation=excitation[1:])
-    return jax.lax.scan(partial(alarm.step, params), alarm.init(params, frames[0]), views)[1]
+    inputs = alarm.AlarmInput(frame=frames[1:], excitation=excitation[1:])
+    return jax.lax.scan(partial(alarm.step, params), alarm.init(params, frames[0]), inputs)[1]
 
 
 def respond(frames, excitation, **changes):

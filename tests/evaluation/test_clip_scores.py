@@ -66,10 +66,11 @@ def test_what_counts(starts, kind, contact, hits, false_alarms, lead):
 def test_an_alarm_begins_in_the_last_of_the_frames_that_it_needs():
     """As in `alarm.step`: 0.2 s at 10 frames a second are two frames."""
     each = series(pulses(1.0, 3.0))
-    assert clip_scores.begin(each, clip_scores.Setting(0.8, 0.0)) == [1.0, 3.0]
-    assert clip_scores.begin(each, clip_scores.Setting(0.8, 0.2)) == [1.1, 3.1]
-    assert clip_scores.begin(each, clip_scores.Setting(0.8, 0.4)) == []
-    assert clip_scores.begin(series(pulses(1.0, 1.6, 3.0)), clip_scores.Setting(0.8, 0.0)) == [1.0, 3.0]  # a short gap
+    assert clip_scores.alarm_onsets(each, clip_scores.Setting(0.8, 0.0)) == [1.0, 3.0]
+    assert clip_scores.alarm_onsets(each, clip_scores.Setting(0.8, 0.2)) == [1.1, 3.1]
+    assert clip_scores.alarm_onsets(each, clip_scores.Setting(0.8, 0.4)) == []
+    short_gap = series(pulses(1.0, 1.6, 3.0))
+    assert clip_scores.alarm_onsets(short_gap, clip_scores.Setting(0.8, 0.0)) == [1.0, 3.0]
 
 
 def made_up_clips():

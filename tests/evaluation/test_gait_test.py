@@ -22,14 +22,14 @@ def trajectory(
     roll: float = 0.0,
     pitch: float = 0.0,
     yaw: float = 0.0,
-    bounce: float = 0.0,
+    heave: float = 0.0,
 ) -> gait_test.GaitTrajectory:
     """Return a walk at constant speed and turn, with sway of these amplitudes, each at its own phase of the cycle."""
     t = np.arange(round(seconds / gait_test.TIME_STEP)) * gait_test.TIME_STEP
     sway = lambda amplitude, phase: amplitude * np.sin(2 * np.pi * t / CYCLE + phase)  # noqa: E731
     headings = heading + turn * t
     steps = speed * gait_test.TIME_STEP * np.stack([np.cos(headings), np.sin(headings)], axis=1)
-    position = np.column_stack([np.cumsum(steps, axis=0), 0.1 + sway(bounce, 0.3)])
+    position = np.column_stack([np.cumsum(steps, axis=0), 0.1 + sway(heave, 0.3)])
     # Small angles, one after the other: yaw about z, pitch about y, roll about x.
     quaternion = _product(_about(2, headings + sway(yaw, 0.7)), _about(1, sway(pitch, 1.1)), _about(0, sway(roll, 2.0)))
     return gait_test.GaitTrajectory(position=position, quaternion=quaternion, feet=np.zeros((len(t), 6, 3)))
@@ -67,7 +67,7 @@ def test_turning_is_unwrapped_through_full_circles(turn):
 
 
 def test_sway_is_its_rms_about_the_mean_and_the_trend():
-    amplitudes = {"roll": 0.01, "pitch": 0.02, "yaw": 0.03, "bounce": 0.002}
+    amplitudes = {"roll": 0.01, "pitch": 0.02, "yaw": 0.03, "heave": 0.002}
     for name, amplitude in amplitudes.items():
         metrics = gait_test.measure_gait(trajectory(0.05, 0.1, **{name: amplitude}), CYCLE)
         assert getattr(metrics, name) == pytest.approx(amplitude / np.sqrt(2), rel=0.02), name
@@ -85,7 +85,7 @@ def test_sway_does_not_change_speed_and_yaw_rate():
 
 def test_the_settling_time_is_left_out():
     """Sway while the gait settles does not change the metrics."""
-    steady, swaying = trajectory(), trajectory(roll=0.3, pitch=0.2, bounce=0.05)
+    steady, swaying = trajectory(), trajectory(roll=0.3, pitch=0.2, heave=0.05)
     settling = np.arange(len(steady.position)) < round(gait_test.SETTLING_TIME / gait_test.TIME_STEP)
     mixed = gait_test.GaitTrajectory(
         position=np.where(settling[:, None], swaying.position, steady.position),

@@ -27,7 +27,7 @@ darkness = SimpleNamespace(Params=lambda: (), init=lambda params, frame: (), ste
 
 @pytest.fixture(scope="module")
 def bench():
-    return stimulus_scores.make_bench(SMOKE, 0)
+    return stimulus_scores.render_clips(SMOKE, 0)
 
 
 def test_clips_have_the_geometry_that_they_show(bench):
@@ -72,7 +72,7 @@ def test_area_under_roc_counts_ties_half():
 )
 def test_unknown_detectors_are_refused(name, message):
     with pytest.raises(InputError, match=message):
-        stimulus_scores.find(name)
+        stimulus_scores.get_detector(name)
 
 
 def test_the_command_writes_table_json_and_figure(tmp_path, capsys):

@@ -79,7 +79,7 @@ def test_an_epoch_equals_rmsprop_by_hand():
     chosen = settings(epochs=1, window=4, streams=1)
     params = navigator.create(jax.random.key(1))
     logged = []
-    with tracking.listening(lambda step, values: logged.append((step, values))):
+    with tracking.add_listener(lambda step, values: logged.append((step, values))):
         fitted = behaviour_cloning.fit(params, walks, [walk(3, 9)], chosen, show_progress=False)
     assert logged == [(1, {"lstm/train_mse": fitted.train_mse[0], "lstm/test_mse": fitted.test_mse[0]})]
     start = behaviour_cloning.standardise(params, walks, mirrored=False)
@@ -217,7 +217,7 @@ def test_an_interrupted_fit_gives_the_same_result(data, tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             behaviour_cloning.fit(params, train, test, chosen, checkpoints=tmp_path / "fit", show_progress=False)
     logged = {}
-    with tracking.listening(lambda step, values: logged.update({step: values})):
+    with tracking.add_listener(lambda step, values: logged.update({step: values})):
         resumed = behaviour_cloning.fit(params, train, test, chosen, checkpoints=tmp_path / "fit", show_progress=False)
     assert list(logged) == list(range(3, EPOCHS + 1))  # the epochs that were not yet saved
     curve = [value for values in logged.values() for name, value in values.items() if name.endswith("fit/test_mse")]

@@ -28,7 +28,7 @@ def fitted(geometry):
     """Fit networks in 300 steps, a twentieth of those of the pretrained networks; return them and the losses."""
     losses = []
     logged = []
-    with tracking.listening(lambda step, values: logged.append((step, values["shaping/loss_mm2"]))):
+    with tracking.add_listener(lambda step, values: logged.append((step, values["shaping/loss_mm2"]))):
         networks = gait_fit.fit(geometry, steps=300, candidates=6, progress=lambda *progress: losses.append(progress))
     assert logged == losses
     return networks, losses

@@ -68,7 +68,7 @@ def test_files_of_older_versions_are_read_without_checksums(stage: Path, stamp: 
 
 def test_a_json_object_with_another_checksum_than_its_own_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
-    storage.write_json(path, checksums.seal({"seed": 1, "scale": "quick"}))
+    storage.write_json(path, checksums.add_checksum({"seed": 1, "scale": "quick"}))
     assert storage.read_json(path)["seed"] == 1
     path.write_text(path.read_text().replace('"seed": 1', '"seed": 2'))
     with pytest.raises(InputError, match="checksum is not that of its contents"):

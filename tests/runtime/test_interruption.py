@@ -63,7 +63,7 @@ def test_a_command_ends_within_two_seconds(doing: str, number: signal.Signals) -
 def test_handlers_are_those_of_before_afterwards() -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     assert exit_code(lambda: 3) == 3
-    with pytest.raises(ZeroDivisionError), interruption.obeying(""):
+    with pytest.raises(ZeroDivisionError), interruption.handling_signals(""):
         raise ZeroDivisionError
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
     interruption.check()
@@ -71,7 +71,7 @@ def test_handlers_are_those_of_before_afterwards() -> None:
 
 def test_an_exception_that_got_lost_is_raised_by_the_next_look() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job ignores
-    with pytest.raises(interruption.Interrupted, match="SIGINT"), interruption.obeying(""):
+    with pytest.raises(interruption.Interrupted, match="SIGINT"), interruption.handling_signals(""):
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         interruption.check()
@@ -82,7 +82,7 @@ def test_ignored_signals_stay_ignored() -> None:
     """As under nohup."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with interruption.obeying(""):
+        with interruption.handling_signals(""):
             signal.raise_signal(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -71,10 +71,10 @@ def test_motion_blur_is_the_mean_of_a_linear_change(pictures):
 
 def test_exposure_brings_every_picture_to_one_mean_and_drifts():
     for grey in (40.0, 200.0):
-        steady, _ = run(Params(adapts=1.0), np.full((150, 2, HEIGHT, WIDTH), grey))
+        steady, _ = run(Params(auto_exposure=1.0), np.full((150, 2, HEIGHT, WIDTH), grey))
         assert steady[-1].mean() == pytest.approx(camera_faults.MEAN_GREY, rel=0.02)
         assert 0 < abs(steady[1].mean() - grey) < 0.15 * grey  # slowly
-    drifting, _ = run(Params(adapts=1.0, drift=0.2), np.full((300, 2, HEIGHT, WIDTH), 118.0))
+    drifting, _ = run(Params(auto_exposure=1.0, drift=0.2), np.full((300, 2, HEIGHT, WIDTH), 118.0))
     assert 5 < np.ptp(drifting[:, 0, 0, 0]) < 120
 
 

@@ -180,7 +180,7 @@ def test_every_window_of_a_fit_is_logged(params, monkeypatch):
     robot, logged = replace(assembly.load_robot(), controller=params), []
     unused: Any = None  # model and rooms, which the stand-ins ignore
     settings = finetuning.Settings(rooms=2, windows_per_room=3)
-    with tracking.listening(lambda step, values: logged.append((step, values["joint/loss"], values["joint/noise"]))):
+    with tracking.add_listener(lambda step, values: logged.append((step, values["joint/loss"], values["joint/noise"]))):
         finetuning.finetune(robot, unused, lambda _: unused, rollout_gradient.Settings(), settings, label="joint")
     assert logged == [(window, 0.25, 0.5) for window in range(1, 7)]
 

@@ -56,7 +56,7 @@ def initial_coupling(monkeypatch):
 def test_both_methods_fit_the_gait_for_the_same_simulated_time(initial_coupling, tmp_path):
     """The sway is least at a coupling 5 % above the initial one; the gradient leaves all other parameters unchanged."""
     logged: dict[str, list[float]] = {}
-    with tracking.listening(lambda _, values: [logged.setdefault(k, []).append(v) for k, v in values.items()]):
+    with tracking.add_listener(lambda _, values: [logged.setdefault(k, []).append(v) for k, v in values.items()]):
         gait_gradient.run(tmp_path, INPUTS, SETTINGS, seed=0)
     rows = json.loads((tmp_path / "gait_gradient.json").read_text())
     assert [(row["method"], row["repeat"]) for row in rows] == [

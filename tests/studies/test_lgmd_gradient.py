@@ -123,7 +123,9 @@ def test_a_fit_approaches_the_detector_of_the_labels(params, data):
     test = data[1]
     evaluate = lambda params: {"choice": lgmd_gradient.score(params, *test)["mse"]}  # noqa: E731
     logged = []
-    with tracking.listening(lambda step, values: logged.append((step, values["fit/choice"], values.get("fit/loss")))):
+    with tracking.add_listener(
+        lambda step, values: logged.append((step, values["fit/choice"], values.get("fit/loss")))
+    ):
         fitted, rows = lgmd_gradient_fit.fit(params, batch_of(data), ("detector",), SETTINGS, evaluate)
     assert logged == [(row["step"], row["choice"], row["loss"]) for row in rows]
     assert [row["step"] for row in rows] == [0, 30, 60, 90, 120]

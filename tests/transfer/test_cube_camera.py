@@ -100,7 +100,7 @@ def test_horizons_agree_within_a_pixel(pairs):
 def test_an_eye_turned_by_a_pixel_is_noticed(robot, pairs):
     model, data = robot
     pixel = EYES.fov / EYES.width
-    lens = camera_faults.Lens(turn=np.array([[0, 0, pixel], [0, 0, pixel]]))
+    lens = camera_faults.LensError(turn=np.array([[0, 0, pixel], [0, 0, pixel]]))
     model.mat_rgba[:, :3] = 0.0
     model.mat_rgba[model.mat("obstacle_12").id, :3] = 1.0
     with cube_camera.CubeCamera(model, EYES, whole=True, lens=lens, face=FACE) as eyes:
