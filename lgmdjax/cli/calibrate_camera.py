@@ -26,7 +26,7 @@ def calibrate(flags: CalibrateCameraFlags) -> Iterator[str]:
     with partial_files.replacing(flags.out.with_suffix(".png")) as partial:
         partial.write_bytes(style.to_png(chessboard.plot(found)))
     lens.write(flags.out, found.lens)
-    left = np.rad2deg(chessboard.bends(found))
+    left = np.rad2deg(chessboard.row_deviations(found))
     yield f"{len(found.used)} pictures used, {len(found.unused)} without the whole board"
     yield f"corners deviate by {found.error:.2f} px from where the lens maps them (root mean square)"
     mean = np.sqrt(np.mean(left**2))

@@ -12,9 +12,9 @@ from lgmdjax.cli.hardware_flags import DriveFlags
 from lgmdjax.deployment import exporter
 from lgmdjax.errors import InputError
 from lgmdjax.hardware import drive_log, joint_map, lens, live_source, servo_bus, supervisor
-from lgmdjax.hardware.camera_reader import Eyes
+from lgmdjax.hardware.camera_reader import StereoReader
 from lgmdjax.hardware.clock import Clock
-from lgmdjax.hardware.driver import Brain, Driver
+from lgmdjax.hardware.driver import Driver, NervousSystem
 from lgmdjax.hardware.inertial import InertialSensor
 from lgmdjax.hardware.joint_map import JointMap
 from lgmdjax.hardware.servo_bus import BusLost, ServoBus
@@ -31,9 +31,9 @@ def drive(flags: DriveFlags) -> int:
     lenses = tuple(lens.read(path) for path in flags.calibration)
     params = exporter.load(flags.run())
     with jax.enable_x64(False):
-        brain = Brain(params)
+        nervous_system = NervousSystem(params)
         with contextlib.ExitStack() as stack:
-            eyes = stack.enter_context(Eyes(flags.camera, lenses, params.camera, clock, mono=flags.mono))
+            eyes = stack.enter_context(StereoReader(flags.camera, lenses, params.camera, clock, mono=flags.mono))
             inertial = None if flags.imu is None else stack.enter_context(InertialSensor(flags.imu))
             bus = stack.enter_context(ServoBus(flags.servos, servos.baud, clock))
             _connect(bus, servos, flags.map)
@@ -44,18 +44,18 @@ def drive(flags: DriveFlags) -> int:
             }
             log = stack.enter_context(drive_log.Writer(_folder(flags), facts))
             print(f"the cameras see {100 * eyes.seen():.0f} % of the eyes' field; log in {log.folder}", flush=True)
-            stops = stack.enter_context(interruption.counting())
+            stop_requests = stack.enter_context(interruption.counting())
             limits = supervisor.Params(lowest_voltage=servos.voltage, highest_temperature=servos.temperature)
             try:
                 driver = Driver(
-                    brain=brain,
+                    nervous_system=nervous_system,
                     eyes=eyes,
                     bus=bus,
                     servos=servos,
                     clock=clock,
                     log=log,
-                    stops=stops,
-                    tell=_tell,
+                    stop_requests=stop_requests,
+                    print_line=_print_line,
                     params=limits,
                     inertial=inertial,
                     seconds=flags.seconds or math.inf,
@@ -103,5 +103,5 @@ def _folder(flags: DriveFlags) -> Path:
     return flags.out / (flags.name or time.strftime("%Y%m%d-%H%M%S"))
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     print(line, flush=True)

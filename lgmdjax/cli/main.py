@@ -21,7 +21,7 @@ from lgmdjax import __version__
 from lgmdjax.cli import environment
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import interruption
-from lgmdjax.runtime.jax_setup import prepare_jax, prepare_opengl
+from lgmdjax.runtime.jax_setup import collect_garbage_rarely, prepare_jax, prepare_opengl
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
 NOT_RESUMED = (
@@ -292,6 +292,7 @@ def _run(given: Sequence[str]) -> int | None:
     summaries = {name: _summary(command) for name, command in COMMANDS.items()}
     name = _choose("lgmdjax", "COMMAND", DESCRIPTION, summaries, given[:1])
     prepare_jax()
+    collect_garbage_rarely()
     return COMMANDS[name](given[1:])
 
 

@@ -13,10 +13,10 @@ from lgmdjax.cli.hardware_flags import RoomName, SimRobotFlags
 from lgmdjax.errors import InputError
 from lgmdjax.hardware import joint_map
 from lgmdjax.hardware.clock import Clock
-from lgmdjax.hardware.faults import FAULTS, Faults
+from lgmdjax.hardware.faults import FAULTS, ActiveFaults
 from lgmdjax.hardware.simulated_body import Body
 from lgmdjax.hardware.simulated_robot import TRACE, PictureServer, Renderer, SimulatedRobot, Terminal
-from lgmdjax.hardware.simulated_servos import Bank
+from lgmdjax.hardware.simulated_servos import ServoBank
 from lgmdjax.sensors import camera
 from lgmdjax.world import scenes
 from lgmdjax.world.arena import Arena, empty_room
@@ -50,7 +50,7 @@ def _assemble(flags: SimRobotFlags, stack: contextlib.ExitStack) -> SimulatedRob
     """Open the ports of a robot, write its joint map, and link its pseudo-terminals."""
     room = jax.jit(ROOMS[flags.room])(jax.random.key(flags.seed))
     servos = joint_map.default()
-    bank, eye = Bank(servos.ids), camera.Params(width=flags.width, height=flags.width * 3 // 4)
+    bank, eye = ServoBank(servos.ids), camera.Params(width=flags.width, height=flags.width * 3 // 4)
     try:
         flags.out.mkdir(parents=True, exist_ok=True)
         eyes = PictureServer(flags.port)
@@ -61,13 +61,13 @@ def _assemble(flags: SimRobotFlags, stack: contextlib.ExitStack) -> SimulatedRob
     robot = SimulatedRobot(
         body=Body(room, servos, bank),
         bank=bank,
-        faults=Faults(dict.fromkeys(flags.fault, 0.0)),
+        faults=ActiveFaults(dict.fromkeys(flags.fault, 0.0)),
         renderer=Renderer(room, eye),
         clock=Clock(flags.speed),
         bus=Terminal(),
         inertial=Terminal(),
         eyes=eyes,
-        tell=partial(print, flush=True),
+        print_line=partial(print, flush=True),
         trace=trace,
     )
     stack.callback(robot.close)

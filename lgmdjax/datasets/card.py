@@ -10,7 +10,7 @@ import numpy as np
 
 from lgmdjax.datasets.formats import DatasetFormat
 from lgmdjax.datasets.lerobot_features import CAMERAS, FEATURES, INDICES, TASK, unit_of
-from lgmdjax.datasets.pictures import Eyes
+from lgmdjax.datasets.pictures import RecordedCamera
 from lgmdjax.datasets.recorded import Recording, cut_episodes
 from lgmdjax.runtime import versions
 from lgmdjax.simulation.closed_loop import FRAME_RATE
@@ -28,7 +28,7 @@ is moved to another start at once (`resets`). Frames that are not `ok` hold the 
 """
 
 
-def describe(recording: Recording, name: str, format: DatasetFormat, eyes: Eyes | None, licence: str) -> str:
+def describe(recording: Recording, name: str, format: DatasetFormat, eyes: RecordedCamera | None, licence: str) -> str:
     """Return the card as Markdown."""
     columns = {"lerobot": _lerobot_rows, "zarr": _zarr_rows}.get(format, _table_rows)(eyes)
     parts = [
@@ -56,7 +56,7 @@ def _front_matter(format: DatasetFormat, licence: str) -> str:
     return "\n".join([*lines, "---", ""])
 
 
-def _what(recording: Recording, eyes: Eyes | None) -> str:
+def _what(recording: Recording, eyes: RecordedCamera | None) -> str:
     walks = recording.walks
     frames = sum(map(len, walks))
     episodes, contacts = len(cut_episodes(walks)), sum(int(np.sum(walk.contact)) for walk in walks)
@@ -70,7 +70,7 @@ def _what(recording: Recording, eyes: Eyes | None) -> str:
     return f"{TASK}\n\n{_table(('what', 'how many'), facts)}"
 
 
-def _how(recording: Recording, eyes: Eyes | None) -> str:
+def _how(recording: Recording, eyes: RecordedCamera | None) -> str:
     header, seeds = recording.header, sorted({walk.seed for walk in recording.walks})
     recorder = ", ".join(f"{name} {version}" for name, version in header.get("versions", {}).items())
     facts = [
@@ -84,11 +84,11 @@ def _how(recording: Recording, eyes: Eyes | None) -> str:
     return f"{_table(('what', 'value'), facts)}\nRecorded with\n\n```json\n{recorded_with}\n```\n"
 
 
-def _table_rows(eyes: Eyes | None) -> list[tuple[str, str, str]]:
+def _table_rows(eyes: RecordedCamera | None) -> list[tuple[str, str, str]]:
     return [(name, UNITS.get(name, "-"), MEANINGS[name]) for name in COLUMNS]
 
 
-def _zarr_rows(eyes: Eyes | None) -> list[tuple[str, str, str]]:
+def _zarr_rows(eyes: RecordedCamera | None) -> list[tuple[str, str, str]]:
     rows = [(name, "-", ORIGIN_MEANINGS[name]) for name in ORIGIN]
     rows += [(name, field.unit or "-", field.meaning) for name, field in FIELDS.items()]
     if eyes is not None:
@@ -96,7 +96,7 @@ def _zarr_rows(eyes: Eyes | None) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _lerobot_rows(eyes: Eyes | None) -> list[tuple[str, str, str]]:
+def _lerobot_rows(eyes: RecordedCamera | None) -> list[tuple[str, str, str]]:
     rows = [
         (name, unit_of(name) or "-", "; ".join(FIELDS[part].meaning for part in parts))
         for name, parts in FEATURES.items()

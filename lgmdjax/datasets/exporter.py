@@ -44,7 +44,7 @@ def export(
     partial_files.require_empty(out)
     recording = recorded.read(run)
     with jax.enable_x64(False), partial_files.new_folder(out) as folder:  # pictures in single precision, as the robot's
-        eyes = pictures.find_eyes(recording) if video else None
+        eyes = pictures.find_camera(recording) if video else None
         if format == "lerobot":
             lerobot.write(folder, recording, eyes)
         elif format == "zarr":

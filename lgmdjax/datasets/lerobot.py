@@ -74,7 +74,7 @@ class _Histograms:
         self.by_episode[episode] = self.by_episode.get(episode, 0) + counts
 
 
-def write(folder: Path, recording: Recording, eyes: pictures.Eyes | None) -> None:
+def write(folder: Path, recording: Recording, eyes: pictures.RecordedCamera | None) -> None:
     """Write the data set into a folder; with `eyes`, also their pictures.
 
     Raises InputError for walks without any frame that is ok, another frame rate, and pictures of an odd size.
@@ -166,7 +166,9 @@ def _to_arrow(values: np.ndarray) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
 
 
-def _write_videos(folder: Path, recording: Recording, episodes: list[_Episode], eyes: pictures.Eyes) -> _Histograms:
+def _write_videos(
+    folder: Path, recording: Recording, episodes: list[_Episode], eyes: pictures.RecordedCamera
+) -> _Histograms:
     """Write the videos of both eyes; return the grey levels of their pictures."""
     histograms = _Histograms()
     of_file: dict[int, list[_Episode]] = {}
@@ -188,7 +190,7 @@ def _write_videos(folder: Path, recording: Recording, episodes: list[_Episode], 
 
 @contextlib.contextmanager
 def _open_video(
-    folder: Path, camera: str, place: tuple[int, int], eyes: pictures.Eyes
+    folder: Path, camera: str, place: tuple[int, int], eyes: pictures.RecordedCamera
 ) -> Iterator[Callable[[UInt8[np.ndarray, "height width channels"]], None]]:
     path = folder / VIDEO.format(camera, *place)
     path.parent.mkdir(parents=True, exist_ok=True)

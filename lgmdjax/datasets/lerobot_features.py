@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from lgmdjax.body import hexapod
-from lgmdjax.datasets.pictures import Eyes
+from lgmdjax.datasets.pictures import RecordedCamera
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import hemifield
 from lgmdjax.simulation.closed_loop import FRAME_RATE
@@ -33,7 +33,7 @@ INDICES |= {"task_index": "int64", "next.done": "bool"}
 """Features that LeRobot requires, and the end of an episode."""
 
 
-def info(episodes: int, frames: int, eyes: Eyes | None) -> JsonObject:
+def info(episodes: int, frames: int, eyes: RecordedCamera | None) -> JsonObject:
     """Return meta/info.json of a data set with this many episodes and frames."""
     features: JsonObject = {name: _describe(name) for name in FEATURES}
     if eyes is not None:
@@ -67,7 +67,7 @@ def _describe(name: str) -> JsonObject:
     return {"dtype": dtype, "shape": [len(names)], "names": names, "info": info}
 
 
-def _describe_video(eyes: Eyes) -> JsonObject:
+def _describe_video(eyes: RecordedCamera) -> JsonObject:
     height, width = eyes.settings.height, eyes.settings.width
     info = {
         "video.height": height,

@@ -31,25 +31,25 @@ Pictures = UInt8[np.ndarray, "frames 2 height width"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Eyes:
-    """The camera that recorded walks were recorded with, and the LGMD behind it."""
+class RecordedCamera:
+    """The stereo camera of recorded walks, and the LGMD behind it."""
 
     settings: CameraSettings
     detector: lgmd.Params
 
 
-def find_eyes(recording: Recording) -> Eyes:
-    """Return the eyes of a recording: those in its header, or of the run that it is in, or of the pretrained robot."""
+def find_camera(recording: Recording) -> RecordedCamera:
+    """Return the camera of a recording: that of its header, of the run that it is in, or of the pretrained robot."""
     parameters = recording.parameters
     if "eyes" in parameters and "lgmd" in parameters:
         settings = CameraSettings(**parameters["eyes"])
-        return Eyes(
+        return RecordedCamera(
             settings=settings, detector=assembly.fit_detector(assembly.lgmd_params(parameters["lgmd"]), settings)
         )
     around = [folder for folder in recording.folder.resolve().parents if (folder / "train").is_dir()]
     runs = [folder for folder in around if (folder / "train" / "controller.safetensors").is_file()]
     robot = assembly.load_robot(runs[0] / "fit-gait", runs[0] / "train") if runs else assembly.load_robot()
-    return Eyes(settings=assembly.camera_settings(robot), detector=robot.controller.lgmd)
+    return RecordedCamera(settings=assembly.camera_settings(robot), detector=robot.controller.lgmd)
 
 
 def find_rooms(recording: Recording) -> list[Arena]:
@@ -61,7 +61,7 @@ def find_rooms(recording: Recording) -> list[Arena]:
         raise InputError(f"{error}: leave --video out") from error
 
 
-def render(eyes: Eyes, room: Arena, walk: Walk) -> Iterator[Pictures]:
+def render(eyes: RecordedCamera, room: Arena, walk: Walk) -> Iterator[Pictures]:
     """Yield the pictures of a walk, some seconds at a time; raise `InputError` if they do not give the recorded u."""
     whole = replace(assembly.camera_params(eyes.settings), overlap=1.0, ground=0.0)
     rooms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], room)
@@ -73,7 +73,7 @@ def render(eyes: Eyes, room: Arena, walk: Walk) -> Iterator[Pictures]:
         yield np.rint(np.clip(pictures, 0, 255)).astype(np.uint8)
 
 
-def _check(eyes: Eyes, walk: Walk, pictures: Float[np.ndarray, "frames 2 height width"]) -> None:
+def _check(eyes: RecordedCamera, walk: Walk, pictures: Float[np.ndarray, "frames 2 height width"]) -> None:
     """Raise `InputError` unless the detector gives the recorded u; not checked if it is constant (no camera)."""
     if len(walk) <= SETTLING_FRAMES or np.ptp(walk.u) == 0:
         return

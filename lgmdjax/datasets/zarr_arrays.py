@@ -28,7 +28,7 @@ COMPRESSION = {"name": "gzip", "configuration": {"level": 5}}
 AXES = {"joints": ("leg", "joint"), "position": ("axis",), "quaternion": ("component",)}  # of all others ("side",)
 
 
-def write(folder: Path, recording: Recording, eyes: pictures.Eyes | None) -> None:
+def write(folder: Path, recording: Recording, eyes: pictures.RecordedCamera | None) -> None:
     """Write the arrays into a folder; with `eyes`, also their pictures."""
     walks = recording.walks
     attributes: JsonObject = {"recorded_with": recording.parameters, "versions": recording.header.get("versions", {})}
@@ -51,7 +51,7 @@ def _write_array(path: Path, values: np.ndarray, axes: tuple[str, ...], attribut
     store.write(values).result()
 
 
-def _write_pictures(folder: Path, recording: Recording, eyes: pictures.Eyes) -> None:
+def _write_pictures(folder: Path, recording: Recording, eyes: pictures.RecordedCamera) -> None:
     """Write the pictures in whole chunks, since each write compresses its chunk again."""
     height, width = eyes.settings.height, eyes.settings.width
     rows = sum(map(len, recording.walks))
@@ -68,7 +68,7 @@ def _write_pictures(folder: Path, recording: Recording, eyes: pictures.Eyes) -> 
         first += len(block)
 
 
-def _blocks(recording: Recording, eyes: pictures.Eyes) -> Iterator[pictures.Pictures]:
+def _blocks(recording: Recording, eyes: pictures.RecordedCamera) -> Iterator[pictures.Pictures]:
     """Yield the pictures of all walks in blocks of `PICTURES_PER_CHUNK`; the last one may be shorter."""
     waiting: list[np.ndarray] = []
     for room, walk in zip(pictures.find_rooms(recording), recording.walks, strict=True):

@@ -67,7 +67,7 @@ class Instruction(IntEnum):
     SYNC_WRITE = 0x83
 
 
-class Fault(IntFlag):
+class StatusError(IntFlag):
     """Error bits of a status packet."""
 
     VOLTAGE = 1

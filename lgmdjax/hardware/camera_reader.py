@@ -96,7 +96,7 @@ class Source(threading.Thread):
                 yield np.ascontiguousarray(frame.picture)
 
 
-class Eyes:
+class StereoReader:
     """The newest pictures of both eyes, from one source or two; use it in a `with` block.
 
     Args:
@@ -131,7 +131,7 @@ class Eyes:
             for index, name in enumerate(sources)
         ]
 
-    def __enter__(self) -> "Eyes":
+    def __enter__(self) -> "StereoReader":
         for source in self._sources:
             source.start()
         try:

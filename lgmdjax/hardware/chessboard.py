@@ -163,7 +163,7 @@ def directions(calibrated: Lens, points: Float[np.ndarray, "n 2"]) -> Float[np.n
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def bends(calibration: Calibration) -> Float[np.ndarray, "pictures rows columns"]:
+def row_deviations(calibration: Calibration) -> Float[np.ndarray, "pictures rows columns"]:
     """Return the angle between each corner and the straight line through its row [rad], positive on one side."""
     pictures, rows, columns, _ = calibration.corners.shape
     rays = directions(calibration.lens, calibration.corners.reshape(-1, 2)).reshape(pictures, rows, columns, 3)
@@ -175,7 +175,7 @@ def bends(calibration: Calibration) -> Float[np.ndarray, "pictures rows columns"
 @style.styled
 def plot(calibration: Calibration) -> Figure:
     """Plot the rows of all boards as seen, and the magnified distance of each corner from its row's straight line."""
-    left = bends(calibration)
+    left = row_deviations(calibration)
     figure = Figure(figsize=(style.WIDTH, 3.6))
     picture, histogram = figure.subplots(1, 2, width_ratios=(1.6, 1))
     width, height = calibration.lens.size

@@ -18,22 +18,22 @@ from jaxtyping import Float
 
 from lgmdjax.deployment import nervous_system
 from lgmdjax.hardware import drive_log, joint_map, postures, supervisor
-from lgmdjax.hardware.ax_servo import Fault
-from lgmdjax.hardware.camera_reader import Eyes, Frame
+from lgmdjax.hardware.ax_servo import StatusError
+from lgmdjax.hardware.camera_reader import Frame, StereoReader
 from lgmdjax.hardware.clock import Clock
 from lgmdjax.hardware.inertial import InertialSensor
 from lgmdjax.hardware.joint_map import JointMap
 from lgmdjax.hardware.servo_bus import BusLost, ServoBus, Status
-from lgmdjax.hardware.supervisor import Mode, Senses
+from lgmdjax.hardware.supervisor import Mode, Readings
 from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS
 
 STEP = 1 / (FRAME_RATE * SUBSTEPS)  # s
 SLOW_MODES = {Mode.RISE: -1, Mode.STAND: -1, Mode.SIT: 0}  # and the index of the posture that they move to
-NO_FAULT = Fault(0)
+NO_ERROR = StatusError(0)
 LATE = 1.5  # frame periods between two pictures; if it is more, a frame was missed
 
 
-class Brain:
+class NervousSystem:
     """The nervous system, compiled, and its state."""
 
     def __init__(self, params: nervous_system.Params):
@@ -54,25 +54,25 @@ class Brain:
 
 
 @dataclass
-class Readings:
+class ServoReadings:
     """The last readings of the servos, by joint."""
 
     angles: Float[np.ndarray, "6 3"]
     loads: list[float | None] = field(default_factory=lambda: [None] * 18)
     temperatures: list[float | None] = field(default_factory=lambda: [None] * 18)
     voltages: list[float | None] = field(default_factory=lambda: [None] * 18)
-    faults: Fault = NO_FAULT
+    errors: StatusError = NO_ERROR
 
     def take(self, servos: JointMap, joint: int, status: Status) -> None:
         """Store the status of a servo."""
         turn = int(servos.directions[joint])
         self.angles.reshape(18)[joint] = joint_map.to_angle(servos, joint, status.position)
         self.loads[joint], self.temperatures[joint] = turn * status.load, status.temperature
-        self.voltages[joint], self.faults = status.voltage, self.faults | status.faults
+        self.voltages[joint], self.errors = status.voltage, self.errors | status.errors
 
     def voltage(self) -> float | None:
         """Return the median voltage of the servos [V], as one may measure badly; 0 if one reports it out of range."""
-        if self.faults & Fault.VOLTAGE:
+        if self.errors & StatusError.VOLTAGE:
             return 0.0
         known = [value for value in self.voltages if value is not None]
         return statistics.median(known) if known else None
@@ -81,7 +81,7 @@ class Readings:
         """Return the highest temperature [degrees Celsius]; infinite if a servo reports that it is too hot."""
         known = [value for value in self.temperatures if value is not None]
         hottest = max(known, default=None)
-        return math.inf if self.faults & Fault.OVERHEATING else hottest
+        return math.inf if self.errors & StatusError.OVERHEATING else hottest
 
 
 @dataclass
@@ -105,14 +105,14 @@ class Timing:
 class Driver:
     """A robot that is driven: its open devices, and its state."""
 
-    brain: Brain
-    eyes: Eyes
+    nervous_system: NervousSystem
+    eyes: StereoReader
     bus: ServoBus
     servos: JointMap
     clock: Clock
     log: drive_log.Writer
-    stops: Callable[[], int]  # requests to stop so far
-    tell: Callable[[str], None]  # prints a line for the user
+    stop_requests: Callable[[], int]  # requests to stop so far
+    print_line: Callable[[str], None]  # prints a line for the user
     params: supervisor.Params
     inertial: InertialSensor | None = None
     seconds: float = math.inf  # of walking
@@ -120,8 +120,8 @@ class Driver:
     def __post_init__(self) -> None:
         self.state = supervisor.init(self.clock.now())
         self.timing = Timing()
-        self.readings = Readings(self._read_all())
-        self.setpoints = self.readings.angles.copy()
+        self.servo_readings = ServoReadings(self._read_all())
+        self.setpoints = self.servo_readings.angles.copy()
         self._output: nervous_system.Output | None = None
         self._frame: Frame | None = None
         self._walked_on: float | None = None  # time of the frame that the output is for
@@ -135,7 +135,7 @@ class Driver:
             while self.state.mode is not Mode.OFF:
                 self._step()
         except BusLost:
-            self.state = supervisor.step(self.params, self.state, self._senses(self.clock.now(), bus_lost=True))
+            self.state = supervisor.step(self.params, self.state, self._readings(self.clock.now(), bus_lost=True))
         except BaseException:
             self._sit_blindly()
             raise
@@ -160,7 +160,7 @@ class Driver:
         now = self.clock.now()
         if frame is not None:
             self._see(frame)
-        before, self.state = self.state.mode, supervisor.step(self.params, self.state, self._senses(now))
+        before, self.state = self.state.mode, supervisor.step(self.params, self.state, self._readings(now))
         if self.state.mode is not before:
             self._enter(now)
         if self.state.mode is Mode.OFF:
@@ -181,31 +181,31 @@ class Driver:
             self.timing.missed += max(round(gap) - 1, 0) if gap > LATE else 0
         self._frame = frame
         if walking:
-            self._output, self._walked_on = self.brain(frame.pictures), frame.time
+            self._output, self._walked_on = self.nervous_system(frame.pictures), frame.time
 
-    def _senses(self, now: float, *, bus_lost: bool = False) -> Senses:
+    def _readings(self, now: float, *, bus_lost: bool = False) -> Readings:
         target = SLOW_MODES.get(self.state.mode)
-        return Senses(
+        return Readings(
             time=now,
             frame_age=math.inf if self._frame is None else now - self._frame.time,
             arrived=target is not None and postures.has_reached(target, self.setpoints),
-            stops=self.stops(),
+            stop_requests=self.stop_requests(),
             finished=now >= self._walk_ends,
             bus_error=self.bus.has_error(),
             bus_lost=bus_lost,
-            voltage=self.readings.voltage(),
-            temperature=self.readings.temperature(),
-            overloaded=bool(self.readings.faults & Fault.OVERLOAD),
+            voltage=self.servo_readings.voltage(),
+            temperature=self.servo_readings.temperature(),
+            overloaded=bool(self.servo_readings.errors & StatusError.OVERLOAD),
             fallen=self.inertial is not None and self.inertial.has_fallen(now),
         )
 
     def _enter(self, now: float) -> None:
         """Begin a mode."""
         mode, reason = self.state.mode, self.state.reason
-        self.tell(f"{now:6.1f} s: {mode.value}" + (f", because {reason.value}" if reason else ""))
+        self.print_line(f"{now:6.1f} s: {mode.value}" + (f", because {reason.value}" if reason else ""))
         self._output = None
         if mode is Mode.WALK:
-            self.brain.restart()
+            self.nervous_system.restart()
             self._walk_ends = min(self._walk_ends, now + self.seconds)
 
     def _send(self, now: float) -> None:
@@ -238,7 +238,7 @@ class Driver:
         if self.state.mode is Mode.SIT:
             return  # waiting for answers would make the motion jerky
         if (status := self.bus.read_status(self.servos.ids[joint])) is not None:
-            self.readings.take(self.servos, joint, status)
+            self.servo_readings.take(self.servos, joint, status)
 
     def _record(self, now: float) -> None:
         """Log a step."""
@@ -249,25 +249,25 @@ class Driver:
             "reason": reason.value if reason else "",
             "frame": frame.number if frame else 0,
             "frame_age": now - frame.time if frame else None,
-            "voltage": self.readings.voltage(),
+            "voltage": self.servo_readings.voltage(),
             "bus_failures": self.bus.failed,
-            "stops": self.stops(),
+            "stops": self.stop_requests(),
         }
         for index, side in enumerate(drive_log.SIDES):
             row[f"u_{side}"] = None if output is None else float(output.u[index])
             row[f"velocity_{side}"] = None if output is None else float(output.velocity[index])
-        angles, targets = self.readings.angles.reshape(18).tolist(), self.setpoints.reshape(18).tolist()
+        angles, targets = self.servo_readings.angles.reshape(18).tolist(), self.setpoints.reshape(18).tolist()
         row |= {f"target_{joint}": value for joint, value in enumerate(targets)}
         row |= {f"joint_{joint}": value for joint, value in enumerate(angles)}
-        row |= {f"load_{joint}": value for joint, value in enumerate(self.readings.loads)}
-        row |= {f"temperature_{joint}": value for joint, value in enumerate(self.readings.temperatures)}
+        row |= {f"load_{joint}": value for joint, value in enumerate(self.servo_readings.loads)}
+        row |= {f"temperature_{joint}": value for joint, value in enumerate(self.servo_readings.temperatures)}
         self.log.add(row)
 
     def _sit_blindly(self) -> None:
         """Lower the robot without reading any sensor, after an error in this program."""
         end = self.clock.now() + self.params.sit_timeout
         try:
-            while self.clock.now() < end and self.stops() < 2 and not postures.has_reached(0, self.setpoints):
+            while self.clock.now() < end and self.stop_requests() < 2 and not postures.has_reached(0, self.setpoints):
                 self.setpoints = postures.toward(0, self.setpoints, postures.SLOW * STEP)
                 self._write_goals()
                 self.eyes.take(STEP)

@@ -21,9 +21,9 @@ import numpy as np
 from lgmdjax.errors import one_line
 from lgmdjax.hardware.ax_servo import Address
 from lgmdjax.hardware.simulated_body import Body
-from lgmdjax.hardware.simulated_servos import Bank
+from lgmdjax.hardware.simulated_servos import ServoBank
 
-Fault = Literal[
+SimulatedFault = Literal[
     "bus-cut",
     "unplugged",
     "frames-stopped",
@@ -34,7 +34,7 @@ Fault = Literal[
     "low-voltage",
     "fall",
 ]
-FAULTS: tuple[Fault, ...] = get_args(Fault)
+FAULTS: tuple[SimulatedFault, ...] = get_args(SimulatedFault)
 VICTIM = 4  # index of the joint whose servo dies or gets hot: the left middle femur
 COLD, HEATING, WARM = 36.0, 4.0, 60.0  # degrees Celsius, degrees Celsius/s, and degrees Celsius at the start of heating
 CHARGED, EMPTY = 111, 90  # 0.1 V
@@ -42,7 +42,7 @@ SHARES = {"corrupt": 1 / 300, "garbled": 1 / 20}  # of bytes
 
 
 @dataclass
-class Faults:
+class ActiveFaults:
     """The active faults, and since when each is active."""
 
     active: dict[str, float] = field(default_factory=dict)  # s
@@ -65,7 +65,7 @@ class Faults:
         """Whether no pictures are sent."""
         return "frames-stopped" in self.active
 
-    def obey(self, line: str) -> str:
+    def switch(self, line: str) -> str:
         """Switch on the fault that a line names, or switch all off for "clear"; return a line for the user."""
         word = line.strip()
         if word == "clear":
@@ -76,7 +76,7 @@ class Faults:
         self.active[word] = self._time
         return f"fault: {word}"
 
-    def act(self, body: Body, bank: Bank, time: float) -> None:
+    def act(self, body: Body, bank: ServoBank, time: float) -> None:
         """Apply the active faults to body and servos."""
         self._time = time
         servo = list(bank.servos.values())[VICTIM]

@@ -1,10 +1,10 @@
 """Slow motions between sitting and standing, and the limits that hold for every motion.
 
-A posture is the joint angles for feet on the floor and a trunk at some height above them. `row` has `POSTURES` of them,
-from the trunk on the floor to the height of the gait, at which the feet are at their neutral positions. At lower
-heights the feet are farther out, since the legs cannot fold enough to sit between them. The trunk moves vertically
-along the row. When a robot is switched on, its legs may be anywhere: they first move to the nearest posture, and then
-along the row.
+A posture is the joint angles for feet on the floor and a trunk at some height above them. `sit_to_stand_postures` is a
+row of `POSTURES` of them, from the trunk on the floor to the height of the gait, at which the feet are at their neutral
+positions. At lower heights the feet are farther out, since the legs cannot fold enough to sit between them. The trunk
+moves vertically along the row. When a robot is switched on, its legs may be anywhere: they first move to the nearest
+posture, and then along the row.
 """
 
 from functools import cache
@@ -37,7 +37,7 @@ class Limits:
 
 
 @cache
-def row() -> Float[np.ndarray, "postures 6 3"]:
+def sit_to_stand_postures() -> Float[np.ndarray, "postures 6 3"]:
     """Return the postures from sitting to standing [rad]; the last one is the stance of the gait."""
     geometry = kinematics.read_geometry(hexapod.load())
     feet = np.asarray(tripod_gait.neutral_feet(tripod_gait.Gait()), float)
@@ -60,7 +60,7 @@ def toward(target: int, angles: Angles, max_change: float) -> Angles:
         angles: present set points [rad].
         max_change: largest change of a joint [rad].
     """
-    postures = row()
+    postures = sit_to_stand_postures()
     target %= POSTURES
     distances = np.abs(postures - angles).max(axis=(1, 2))
     nearest = int(np.argmin(distances))
@@ -71,7 +71,7 @@ def toward(target: int, angles: Angles, max_change: float) -> Angles:
 
 def has_reached(target: int, angles: Angles) -> bool:
     """Return whether set points are within `TOLERANCE` of a posture of the row."""
-    return bool(np.abs(row()[target] - angles).max() <= TOLERANCE)
+    return bool(np.abs(sit_to_stand_postures()[target] - angles).max() <= TOLERANCE)
 
 
 def limit(limits: Limits, before: Angles, wanted: Angles, max_change: float) -> Angles:

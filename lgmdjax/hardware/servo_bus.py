@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.hardware import ax_servo
-from lgmdjax.hardware.ax_servo import Address, Fault
+from lgmdjax.hardware.ax_servo import Address, StatusError
 from lgmdjax.hardware.clock import Clock
 
 HAS_SDK = find_spec("dynamixel_sdk") is not None and find_spec("serial") is not None
@@ -30,7 +30,6 @@ STATUS_LENGTH = 8  # bytes: position, speed, load, voltage, temperature
 ANSWER_TIMEOUT = 0.012  # s; a USB adapter may hold back an answer for some milliseconds
 MAX_FAILURES = 4  # of a servo in a row
 CONNECT_ATTEMPTS, RELEASE_ATTEMPTS = 10, 6  # a servo may need time to start
-STOPPING = Fault.OVERHEATING | Fault.OVERLOAD | Fault.VOLTAGE  # errors that a servo adds to its answer
 
 
 class BusLost(Exception):
@@ -46,7 +45,7 @@ class Status:
     load: float  # of the stall torque, positive counter-clockwise
     voltage: float  # V
     temperature: float  # degrees Celsius
-    faults: Fault
+    errors: StatusError
 
 
 class ServoBus:
@@ -130,7 +129,7 @@ class ServoBus:
             load=ax_servo.from_signed(load) / ax_servo.HIGHEST,
             voltage=data[6] * ax_servo.VOLTAGE_UNIT,
             temperature=float(data[7]),
-            faults=Fault(error),
+            errors=StatusError(error),
         )
 
     def has_error(self) -> bool:
@@ -166,9 +165,10 @@ class ServoBus:
         return result == COMM_SUCCESS and torque == 0
 
     def _write_word(self, servo: int, address: Address, entry: int) -> None:
+        refused = StatusError.RANGE | StatusError.CHECKSUM | StatusError.INSTRUCTION
         for _ in range(CONNECT_ATTEMPTS):
             result, error = self._call(lambda: self._packets.write2ByteTxRx(self._port, servo, address, entry))
-            if result == COMM_SUCCESS and not error & (Fault.RANGE | Fault.CHECKSUM | Fault.INSTRUCTION):
+            if result == COMM_SUCCESS and not error & refused:
                 return
         raise InputError(f"expected servo {servo} to accept its limits, got no answer; check its cable")
 

@@ -17,7 +17,7 @@ from lgmdjax.body import hexapod
 from lgmdjax.hardware import ax_servo, postures
 from lgmdjax.hardware.ax_servo import Address
 from lgmdjax.hardware.joint_map import JointMap, to_angles, to_positions
-from lgmdjax.hardware.simulated_servos import Bank
+from lgmdjax.hardware.simulated_servos import ServoBank
 from lgmdjax.world import arena
 from lgmdjax.world.obstacles import Prisms
 
@@ -46,7 +46,7 @@ class Body:
         bank: the servos, whose tables the body reads and writes.
     """
 
-    def __init__(self, room: arena.Arena, servos: JointMap, bank: Bank):
+    def __init__(self, room: arena.Arena, servos: JointMap, bank: ServoBank):
         self.model = _compile(room)
         self.data = mujoco.MjData(self.model)
         self._map, self._bank = servos, bank
@@ -124,7 +124,7 @@ class Body:
     def _set_start(self, room: arena.Arena) -> None:
         """Put the robot at the room's start, on its belly, with its legs at random angles near those of sitting."""
         x, y, yaw = np.asarray(room.start, float)
-        legs = postures.row()[0] + np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3))
+        legs = postures.sit_to_stand_postures()[0] + np.random.default_rng(0).uniform(-0.15, 0.15, (6, 3))
         low, high = hexapod.target_limits()
         self.data.qpos[:3] = x, y, START_HEIGHT
         self.data.qpos[3:7] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)

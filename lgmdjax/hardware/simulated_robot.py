@@ -33,9 +33,9 @@ from jaxtyping import UInt8
 from lgmdjax.body import hexapod
 from lgmdjax.hardware import ax_servo
 from lgmdjax.hardware.clock import Clock
-from lgmdjax.hardware.faults import Faults
+from lgmdjax.hardware.faults import ActiveFaults
 from lgmdjax.hardware.simulated_body import Body
-from lgmdjax.hardware.simulated_servos import Bank
+from lgmdjax.hardware.simulated_servos import ServoBank
 from lgmdjax.sensors import camera
 from lgmdjax.simulation.closed_loop import FRAME_RATE, SUBSTEPS
 from lgmdjax.world import arena
@@ -174,14 +174,14 @@ class SimulatedRobot:
     """A simulated robot: its parts, which are open, and its state."""
 
     body: Body
-    bank: Bank
-    faults: Faults
+    bank: ServoBank
+    faults: ActiveFaults
     renderer: Renderer
     clock: Clock
     bus: Terminal
     inertial: Terminal
     eyes: PictureServer
-    tell: Callable[[str], None]  # prints a line for the user
+    print_line: Callable[[str], None]  # prints a line for the user
     trace: TextIO | None = None
     time: float = 0.0  # s, of the physics
     pictures: int = 0  # sent so far
@@ -197,7 +197,7 @@ class SimulatedRobot:
         return self.clock.now() - self._lag
 
     def run(self, seconds: float, commands: int | None) -> None:
-        """Serve for some seconds; obey the names of faults in the lines of an open file, `commands`, until its end."""
+        """Serve for some seconds; switch faults as the lines of an open file, `commands`, say, until its end."""
         self._lag = self.clock.now()
         while self.time < seconds:
             self.turn(None if self._at_end else commands)
@@ -246,14 +246,14 @@ class SimulatedRobot:
         if self.bus.is_open and self.bus.file in ready:
             self._answer(self.faults.garble(self.bus.read()))
         if commands is not None and commands in ready:
-            self._obey(os.read(commands, 4096))
+            self._execute(os.read(commands, 4096))
 
-    def _obey(self, received: bytes) -> None:
-        """Obey the complete lines."""
+    def _execute(self, received: bytes) -> None:
+        """Switch the faults that the complete lines name."""
         self._at_end = not received
         *lines, self._command = (self._command + received).split(b"\n")
         for line in lines:
-            self.tell(f"{self.time:.1f} s: {self.faults.obey(line.decode(errors='replace'))}")
+            self.print_line(f"{self.time:.1f} s: {self.faults.switch(line.decode(errors='replace'))}")
 
     def _answer(self, received: bytes) -> None:
         """Queue the answers to bytes of the bus."""

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from lgmdjax.hardware import ax_servo
-from lgmdjax.hardware.ax_servo import Address, Fault, Instruction
+from lgmdjax.hardware.ax_servo import Address, Instruction, StatusError
 
 HEADER = b"\xff\xff"
 SHORTEST = 6  # bytes of a packet
@@ -130,76 +130,78 @@ class Servo:
         if address in WORDS:
             self.table[address + 1] = value >> 8
 
-    def alarms(self) -> Fault:
+    def alarms(self) -> StatusError:
         """Return the errors of voltage and temperature, which last as long as their causes."""
-        voltage, found = self.entry(Address.PRESENT_VOLTAGE), Fault(0)
+        voltage, found = self.entry(Address.PRESENT_VOLTAGE), StatusError(0)
         if not self.entry(Address.LOWEST_VOLTAGE) <= voltage <= self.entry(Address.HIGHEST_VOLTAGE):
-            found |= Fault.VOLTAGE
+            found |= StatusError.VOLTAGE
         if self.entry(Address.PRESENT_TEMPERATURE) > self.entry(Address.HIGHEST_TEMPERATURE):
-            found |= Fault.OVERHEATING
+            found |= StatusError.OVERHEATING
         return found
 
-    def obey(self, packet: Packet) -> Answer | None:
+    def execute(self, packet: Packet) -> Answer | None:
         """Execute a packet; return the answer, or None if there is none."""
         if self.dead:
             return None
         if not packet.intact:
-            return self._answer(packet, Fault.CHECKSUM)
-        content, fault = b"", Fault(0)
+            return self._answer(packet, StatusError.CHECKSUM)
+        content, error = b"", StatusError(0)
         match packet.instruction:
             case Instruction.PING:
-                return self._answer(packet, fault, always=True)
+                return self._answer(packet, error, always=True)
             case Instruction.READ if len(packet.parameters) == 2:
-                content, fault = self._read(*packet.parameters)
+                content, error = self._read(*packet.parameters)
             case Instruction.WRITE if len(packet.parameters) >= 2:
-                fault = self._write(packet.parameters)
+                error = self._write(packet.parameters)
             case Instruction.REG_WRITE if len(packet.parameters) >= 2:
                 self.registered = packet.parameters
                 self.write_entry(Address.REGISTERED, 1)
             case Instruction.ACTION if self.registered:
-                fault, self.registered = self._write(self.registered), b""
+                error, self.registered = self._write(self.registered), b""
                 self.write_entry(Address.REGISTERED, 0)
             case Instruction.RESET:
                 self.reset()
             case _:
-                fault = Fault.INSTRUCTION
-        return self._answer(packet, fault, content)
+                error = StatusError.INSTRUCTION
+        return self._answer(packet, error, content)
 
-    def _read(self, address: int, size: int) -> tuple[bytes, Fault]:
+    def _read(self, address: int, size: int) -> tuple[bytes, StatusError]:
         if address + size > ax_servo.TABLE_SIZE:
-            return b"", Fault.RANGE
-        return self.table[address : address + size].tobytes(), Fault(0)
+            return b"", StatusError.RANGE
+        return self.table[address : address + size].tobytes(), StatusError(0)
 
-    def _write(self, parameters: bytes) -> Fault:
+    def _write(self, parameters: bytes) -> StatusError:
         """Write bytes, starting at an address, all or none; return the error."""
         address, content = parameters[0], parameters[1:]
         span = range(address, address + len(content))
         if not all(byte in WRITABLE or byte in LATER_WRITABLE for byte in span):
-            return Fault.RANGE
+            return StatusError.RANGE
         before = self.table.copy()
         self.table[span.start : span.stop] = np.frombuffer(content, np.uint8)
         if any(self.entry(entry) > LARGEST[entry] for entry in span if entry in LARGEST):
             self.table[:] = before
-            return Fault.RANGE
+            return StatusError.RANGE
         if Address.GOAL_POSITION not in span:
-            return Fault(0)
+            return StatusError(0)
         lowest, highest = self.entry(Address.LOWEST_POSITION), self.entry(Address.HIGHEST_POSITION)
         goal = self.entry(Address.GOAL_POSITION)
         self.write_entry(Address.GOAL_POSITION, min(max(goal, lowest), highest))
         self.write_entry(Address.TORQUE_ENABLE, 1)
-        return Fault(0) if lowest <= goal <= highest else Fault.ANGLE
+        return StatusError(0) if lowest <= goal <= highest else StatusError.ANGLE
 
-    def _answer(self, packet: Packet, fault: Fault, content: bytes = b"", *, always: bool = False) -> Answer | None:
+    def _answer(
+        self, packet: Packet, error: StatusError, content: bytes = b"", *, always: bool = False
+    ) -> Answer | None:
         """Return a status packet if the table asks for one: level 0 for pings, 1 for reads too, 2 for all."""
         needed = 0 if always else 1 if packet.instruction == Instruction.READ else 2
         if packet.servo == ax_servo.BROADCAST or self.entry(Address.STATUS_RETURN_LEVEL) < needed:
             return None
-        body = bytes([self.number, len(content) + 2, fault | self.alarms()]) + content
+        body = bytes([self.number, len(content) + 2, error | self.alarms()]) + content
         delay = self.entry(Address.RETURN_DELAY) * ax_servo.DELAY_UNIT
         return Answer(delay, HEADER + body + bytes([checksum(body)]))
 
 
-class Bank:
+class ServoBank:
     """Servos on one bus, whose tables are the rows of one array, in the order of `ids`."""
 
     def __init__(self, ids: tuple[int, ...]):
@@ -234,7 +236,7 @@ class Bank:
                 continue
             everyone = packet.servo == ax_servo.BROADCAST
             addressed = self.servos.values() if everyone else filter(None, [self.servos.get(packet.servo)])
-            answers += filter(None, [servo.obey(packet) for servo in addressed])
+            answers += filter(None, [servo.execute(packet) for servo in addressed])
         return answers
 
     def _write_in_sync(self, parameters: bytes) -> None:
@@ -246,4 +248,4 @@ class Bank:
             servo, content = parameters[first], parameters[first + 1 : first + 1 + size]
             if servo in self.servos:
                 write = Packet(ax_servo.BROADCAST, Instruction.WRITE, bytes([address]) + content)
-                self.servos[servo].obey(write)
+                self.servos[servo].execute(write)

@@ -54,13 +54,13 @@ class Params:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Senses:
+class Readings:
     """What is known at one moment; a fault that cannot be known, as without an inertial sensor, counts as absent."""
 
     time: float  # s
     frame_age: float  # s since the last new frame; infinite before the first
     arrived: bool  # the legs have reached the posture of the mode
-    stops: int = 0  # requests to stop: Ctrl-C, SIGTERM, SIGHUP
+    stop_requests: int = 0  # requests to stop: Ctrl-C, SIGTERM, SIGHUP
     finished: bool = False  # the time that the user gave is up
     bus_error: bool = False  # a servo is silent or garbled for too long
     bus_lost: bool = False  # nothing can be sent
@@ -85,56 +85,56 @@ def init(time: float) -> State:
     return State(mode=Mode.RISE, since=time)
 
 
-def step(params: Params, state: State, senses: Senses) -> State:
+def step(params: Params, state: State, readings: Readings) -> State:
     """Return the next state, from what is known now."""
-    state = replace(state, frames_since=_frames_since(params, state, senses))
+    state = replace(state, frames_since=_frames_since(params, state, readings))
     if state.mode is Mode.OFF:
         return state
-    if senses.bus_lost:
-        return _enter(state, Mode.OFF, senses, Reason.BUS_LOST)
-    if senses.stops >= 2:
-        return _enter(state, Mode.OFF, senses, state.reason or Reason.STOPPED)
+    if readings.bus_lost:
+        return _enter(state, Mode.OFF, readings, Reason.BUS_LOST)
+    if readings.stop_requests >= 2:
+        return _enter(state, Mode.OFF, readings, state.reason or Reason.STOPPED)
     if state.mode is Mode.SIT:
-        seated = senses.arrived or senses.time - state.since > params.sit_timeout
-        return _enter(state, Mode.OFF, senses, state.reason) if seated else state
-    if (reason := _reason_to_sit(params, state, senses)) is not None:
-        return _enter(state, Mode.SIT, senses, reason)
+        seated = readings.arrived or readings.time - state.since > params.sit_timeout
+        return _enter(state, Mode.OFF, readings, state.reason) if seated else state
+    if (reason := _reason_to_sit(params, state, readings)) is not None:
+        return _enter(state, Mode.SIT, readings, reason)
     if state.mode is Mode.RISE:
-        return _enter(state, Mode.STAND, senses) if senses.arrived else state
-    if senses.frame_age > params.frame_timeout:
-        return _enter(state, Mode.STAND, senses) if state.mode is Mode.WALK else state
-    if state.mode is Mode.STAND and senses.arrived and _has_frames(params, state, senses):
-        return _enter(state, Mode.WALK, senses)
+        return _enter(state, Mode.STAND, readings) if readings.arrived else state
+    if readings.frame_age > params.frame_timeout:
+        return _enter(state, Mode.STAND, readings) if state.mode is Mode.WALK else state
+    if state.mode is Mode.STAND and readings.arrived and _has_frames(params, state, readings):
+        return _enter(state, Mode.WALK, readings)
     return state
 
 
-def _reason_to_sit(params: Params, state: State, senses: Senses) -> Reason | None:
+def _reason_to_sit(params: Params, state: State, readings: Readings) -> Reason | None:
     """Return the first reason to sit down; None if there is none."""
-    elapsed = senses.time - state.since
-    waits = state.mode is Mode.STAND and senses.frame_age > params.frame_timeout
+    elapsed = readings.time - state.since
+    waits = state.mode is Mode.STAND and readings.frame_age > params.frame_timeout
     reasons = {
-        Reason.FALLEN: senses.fallen,
-        Reason.BUS_ERROR: senses.bus_error,
-        Reason.HOT: senses.temperature is not None and senses.temperature >= params.highest_temperature,
-        Reason.OVERLOADED: senses.overloaded or (state.mode is Mode.RISE and elapsed > params.rise_timeout),
-        Reason.LOW_VOLTAGE: senses.voltage is not None and senses.voltage < params.lowest_voltage,
-        Reason.STOPPED: senses.stops > 0,
-        Reason.FINISHED: senses.finished,
+        Reason.FALLEN: readings.fallen,
+        Reason.BUS_ERROR: readings.bus_error,
+        Reason.HOT: readings.temperature is not None and readings.temperature >= params.highest_temperature,
+        Reason.OVERLOADED: readings.overloaded or (state.mode is Mode.RISE and elapsed > params.rise_timeout),
+        Reason.LOW_VOLTAGE: readings.voltage is not None and readings.voltage < params.lowest_voltage,
+        Reason.STOPPED: readings.stop_requests > 0,
+        Reason.FINISHED: readings.finished,
         Reason.NO_FRAMES: waits and elapsed > params.stand_timeout,
     }
     return next((reason for reason, holds in reasons.items() if holds), None)
 
 
-def _frames_since(params: Params, state: State, senses: Senses) -> float | None:
+def _frames_since(params: Params, state: State, readings: Readings) -> float | None:
     """Return since when frames have come without a gap."""
-    if senses.frame_age > params.frame_timeout:
+    if readings.frame_age > params.frame_timeout:
         return None
-    return senses.time if state.frames_since is None else state.frames_since
+    return readings.time if state.frames_since is None else state.frames_since
 
 
-def _has_frames(params: Params, state: State, senses: Senses) -> bool:
-    return state.frames_since is not None and senses.time - state.frames_since >= params.frames_for
+def _has_frames(params: Params, state: State, readings: Readings) -> bool:
+    return state.frames_since is not None and readings.time - state.frames_since >= params.frames_for
 
 
-def _enter(state: State, mode: Mode, senses: Senses, reason: Reason | None = None) -> State:
-    return replace(state, mode=mode, since=senses.time, reason=reason)
+def _enter(state: State, mode: Mode, readings: Readings, reason: Reason | None = None) -> State:
+    return replace(state, mode=mode, since=readings.time, reason=reason)

@@ -1,8 +1,8 @@
 """The nervous systems of a batch of robots, at a real robot's two rates: that of pictures and that of set points.
 
-`see` processes a picture; `move` runs 180 times a second, with or without a new picture. Both call the functions of
-`lgmdjax.control.controller`, as the closed loop in MJX and `deployment.nervous_system` do: with a picture before every
-sixth set point, they are the same system.
+`process_picture` runs once for each picture, `next_targets` 180 times a second, with or without a new picture. Both
+call the functions of `lgmdjax.control.controller`, as the closed loop in MJX and `deployment.nervous_system` do: with a
+picture before every sixth set point, they are the same system.
 """
 
 from dataclasses import replace
@@ -62,7 +62,7 @@ def init(params: closed_loop.Params, faults: Faults, key: Array) -> State:
     )
 
 
-def see(
+def process_picture(
     params: closed_loop.Params,
     faults: Faults,
     state: State,
@@ -96,7 +96,7 @@ def _previous(state: State, pictures: Array) -> Array:
     return jnp.where(started, pictures, state.cameras.previous)
 
 
-def move(params: closed_loop.Params, faults: Faults, state: State) -> tuple[State, Float[Array, "6 3"]]:
+def next_targets(params: closed_loop.Params, faults: Faults, state: State) -> tuple[State, Float[Array, "6 3"]]:
     """Advance the CPG by `INTERVAL`; return the set points [rad] that arrive at the joints."""
     moved, targets = controller.move(params.controller, state.controller, INTERVAL)
     limits = jnp.asarray(hexapod.target_limits(), targets.dtype)
@@ -118,15 +118,19 @@ def init_batch(params: closed_loop.Params, faults: Faults, keys: Array) -> State
 
 
 @jax.jit
-def see_batch(params: closed_loop.Params, faults: Faults, states: State, pictures: Array, ranges: Array) -> State:
-    """Call `see` for a batch of robots."""
-    return jax.vmap(see, in_axes=(None, 0, 0, 0, 0))(params, faults, states, pictures, ranges)
+def process_picture_batch(
+    params: closed_loop.Params, faults: Faults, states: State, pictures: Array, ranges: Array
+) -> State:
+    """Call `process_picture` for a batch of robots."""
+    return jax.vmap(process_picture, in_axes=(None, 0, 0, 0, 0))(params, faults, states, pictures, ranges)
 
 
 @jax.jit
-def move_batch(params: closed_loop.Params, faults: Faults, states: State) -> tuple[State, Float[Array, "robots 6 3"]]:
-    """Call `move` for a batch of robots."""
-    return jax.vmap(move, in_axes=(None, 0, 0))(params, faults, states)
+def next_targets_batch(
+    params: closed_loop.Params, faults: Faults, states: State
+) -> tuple[State, Float[Array, "robots 6 3"]]:
+    """Call `next_targets` for a batch of robots."""
+    return jax.vmap(next_targets, in_axes=(None, 0, 0))(params, faults, states)
 
 
 @jax.jit

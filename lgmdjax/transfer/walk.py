@@ -142,11 +142,11 @@ class _Batch:
         for index, eyes in enumerate(self.cameras):
             pictures[index] = eyes.render(self.bodies[index].data)
         ranges = np.stack([self._scan(body) for body in self.bodies])
-        self.states = nervous_systems.see_batch(self.robot, self.faults, self.states, pictures, ranges)
+        self.states = nervous_systems.process_picture_batch(self.robot, self.faults, self.states, pictures, ranges)
 
     def _move(self) -> np.ndarray:
         """Advance by one physics step; return which robots touched something in it."""
-        self.states, targets = nervous_systems.move_batch(self.robot, self.faults, self.states)
+        self.states, targets = nervous_systems.next_targets_batch(self.robot, self.faults, self.states)
         targets = np.asarray(targets, float).reshape(len(self.bodies), -1)
         touched = np.zeros(len(self.bodies), bool)
         for index in np.flatnonzero(self.ok).tolist():

@@ -126,7 +126,7 @@ class LivePanel:
             gui.add_markdown("Drag an obstacle to move it.")
             self.place = gui.add_button("Place the robot: click the floor", icon=viser.Icon.HAND_CLICK)
             self.heading = gui.add_slider("Heading [°]", -180, 180, 5, 0)
-            self.keep = gui.add_button("Record", icon=viser.Icon.VIDEO)
+            self.record = gui.add_button("Record", icon=viser.Icon.VIDEO)
         self._listen()
 
     def enter(self, constants: Constants) -> None:

@@ -30,10 +30,10 @@ from lgmdjax.simulation.closed_loop import Record
 from lgmdjax.viewer.live_step import with_centres
 from lgmdjax.world import arena
 
-FILM_SECONDS = 60.0
+VIDEO_SECONDS = 60.0
 
 
-class Kept:
+class LiveRecording:
     """Frames of a live simulation since the start of a recording."""
 
     def __init__(self, room: arena.Arena):
@@ -56,7 +56,7 @@ class Kept:
             writer = episodes.Writer(partial, {"live": parameters})
             writer.write(record, episode=0, rooms=[0], seed=int(str(place["seed"])))
             rooms = rooms_at(self.room, np.stack(self.centres))
-            seconds = min(FILM_SECONDS, len(self.records) / closed_loop.FRAME_RATE / 2)
+            seconds = min(VIDEO_SECONDS, len(self.records) / closed_loop.FRAME_RATE / 2)
             trace = walk_video.WalkTrace(*(getattr(record, name)[0] for name in walk_video.WalkTrace._fields))
             walk_video.write_trace(partial / "walk.mp4", trace, rooms, robot.camera, seconds)
         return folder

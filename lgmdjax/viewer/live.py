@@ -23,11 +23,11 @@ from lgmdjax.viewer.messages import (
     Constants,
     Controls,
     Entered,
-    Keep,
     Live,
     LiveFrame,
     Move,
     Place,
+    RecordCommand,
     Report,
     Status,
     Step,
@@ -55,7 +55,7 @@ class LiveSimulation:
         jax.block_until_ready(live_step.frame(self.params, self.model, self.room, self.state))
         self.steps = 0  # frames to simulate while paused
         self.due, self.seconds = time.monotonic(), 0.0
-        self.kept: edits.Kept | None = None
+        self.recording: edits.LiveRecording | None = None
         report(Status("live"))
 
     def entered(self) -> Entered:
@@ -74,7 +74,7 @@ class LiveSimulation:
             self.due = time.monotonic()
         self.controls, self.params = controls, live_step.steer(self.robot, controls)
 
-    def obey(self, command: Move | Place | Step | Keep) -> None:
+    def execute(self, command: Move | Place | Step | RecordCommand) -> None:
         """Change the room or the robot's pose, step, or record."""
         match command:
             case Move():
@@ -83,11 +83,11 @@ class LiveSimulation:
                 self.state = live_step.place(self.params, self.room, self.state, jnp.asarray(command, float))
             case Step():
                 self.steps += 1
-            case Keep(on=True):
-                self.kept = edits.Kept(self.room.arena)
+            case RecordCommand(on=True):
+                self.recording = edits.LiveRecording(self.room.arena)
                 self.report(Status("live: recording"))
-            case Keep(folder=folder) if self.kept is not None and folder is not None:
-                self._write(folder, self.kept)
+            case RecordCommand(folder=folder) if self.recording is not None and folder is not None:
+                self._write(folder, self.recording)
 
     def advance(self) -> LiveFrame:
         """Simulate a frame and return it."""
@@ -98,11 +98,11 @@ class LiveSimulation:
         took = time.monotonic() - started
         self.seconds = SMOOTHING * self.seconds + (1 - SMOOTHING) * took if self.seconds else took
         self.due = max(self.due + 1 / (FRAME_RATE * self.controls.pace), time.monotonic() - MAX_LAG)
-        if self.kept is not None:
-            self.kept.append(record, self._centres())
+        if self.recording is not None:
+            self.recording.append(record, self._centres())
         return self._frame(record, senses)
 
-    def _frame(self, record: Record, senses: live_step.Senses) -> LiveFrame:
+    def _frame(self, record: Record, senses: live_step.SensedFrame) -> LiveFrame:
         return LiveFrame(
             time=float(record.time),
             computed=time.monotonic(),
@@ -121,11 +121,11 @@ class LiveSimulation:
     def _centres(self) -> np.ndarray:
         return room_shape.centres_of(arena.at_time(self.room.arena, int(self.state.frame) / FRAME_RATE))
 
-    def _write(self, folder: Path, kept: edits.Kept) -> None:
-        self.kept = None
+    def _write(self, folder: Path, recording: edits.LiveRecording) -> None:
+        self.recording = None
         self.report(Status("live: writing the episode and its video"))
         place = {"room": self.command.room, "seed": self.command.seed}
-        written = kept.write(folder, self.robot, self.controls.policy, place)
+        written = recording.write(folder, self.robot, self.controls.policy, place)
         self.due = time.monotonic()
         self.report(Status(f"live; wrote {written}"))
 

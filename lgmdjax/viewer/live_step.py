@@ -43,7 +43,7 @@ class SteeredParams:
 
 
 @struct.dataclass(kw_only=True)
-class Senses:
+class SensedFrame:
     """What the robot senses in a frame, as bytes for display."""
 
     pictures: UInt8[Array, "2 height width"]
@@ -94,18 +94,20 @@ def start(params: closed_loop.Params, model: mjx.Model, room: closed_loop.Room) 
 @cached_jit
 def frame(
     params: closed_loop.Params, model: mjx.Model, room: closed_loop.Room, state: closed_loop.State
-) -> tuple[closed_loop.State, closed_loop.Record, Senses]:
+) -> tuple[closed_loop.State, closed_loop.Record, SensedFrame]:
     """Return the next state, its record, and what the robot sensed."""
     before = state.controller.lgmd.difference
     after, record = closed_loop.step(params, model, room, state, STEERED)
     scene = arena.at_time(room.arena, record.time)
     pictures = _render_whole(params, scene, record.position, record.quaternion)
     layers = _layers(params.controller.lgmd, before, after.controller.lgmd, record.is_first)
-    return after, record, Senses(pictures=_to_bytes(pictures), layers=layers)
+    return after, record, SensedFrame(pictures=_to_bytes(pictures), layers=layers)
 
 
 @cached_jit
-def replay(params: closed_loop.Params, room: arena.Arena, state: lgmd.State, poses: Poses) -> tuple[lgmd.State, Senses]:
+def replay(
+    params: closed_loop.Params, room: arena.Arena, state: lgmd.State, poses: Poses
+) -> tuple[lgmd.State, SensedFrame]:
     """Return what a robot sensed in some frames of a recorded walk, and the state of its LGMDs after them.
 
     Args:
@@ -115,7 +117,7 @@ def replay(params: closed_loop.Params, room: arena.Arena, state: lgmd.State, pos
         poses: the frames.
     """
 
-    def step(state: lgmd.State, at: Poses) -> tuple[lgmd.State, Senses]:
+    def step(state: lgmd.State, at: Poses) -> tuple[lgmd.State, SensedFrame]:
         pictures = _render_whole(params, with_centres(room, at.centres), at.position, at.quaternion)
         frames = _crop(params.camera, pictures)
         first = controller.init_lgmd(params.controller, frames)
@@ -124,7 +126,7 @@ def replay(params: closed_loop.Params, room: arena.Arena, state: lgmd.State, pos
             params.controller.lgmd, before, hemifield.outermost_first(frames)
         )
         layers = _layers(params.controller.lgmd, before.difference, after, at.is_first)
-        return after, Senses(pictures=_to_bytes(pictures), layers=layers)
+        return after, SensedFrame(pictures=_to_bytes(pictures), layers=layers)
 
     return jax.lax.scan(step, state, poses)
 

@@ -10,13 +10,13 @@ Only the simulator imports JAX, so that the viewer's page appears at once.
 | `Move`          | move an obstacle                                                     |
 | `Place`         | move the robot                                                       |
 | `Step`          | simulate one more frame, while paused                                |
-| `Keep`          | start to record frames, or stop and write them                       |
+| `RecordCommand` | start to record frames, or stop and write them                       |
 
 | from the simulator  | meaning                                              |
 | ------------------- | ---------------------------------------------------- |
 | `Status`            | what it does; `failed` if it cannot continue         |
 | `Walks`             | what a path contains, and one of its walks           |
-| `Senses`            | pictures and layers of some frames of that walk      |
+| `SensedFrames`      | pictures and layers of some frames of that walk      |
 | `Entered`           | the room of the live simulation                      |
 | `LiveFrame`         | one simulated frame                                  |
 """
@@ -82,7 +82,7 @@ class Step(NamedTuple):
     """Simulate one frame."""
 
 
-class Keep(NamedTuple):
+class RecordCommand(NamedTuple):
     """Record frames from now on if `on`, else write the recording into `folder`."""
 
     on: bool
@@ -112,7 +112,7 @@ class Walks(NamedTuple):
     playback: Playback
 
 
-class Senses(NamedTuple):
+class SensedFrames(NamedTuple):
     """Pictures and layers of the walk `index` of a path, from frame `first` on; the shapes are those of `Playback`."""
 
     index: int
@@ -146,5 +146,5 @@ class LiveFrame(NamedTuple):
     layers: ndarray
 
 
-Command = Open | Live | Controls | Move | Place | Step | Keep
-Report = Status | Walks | Senses | Entered | LiveFrame
+Command = Open | Live | Controls | Move | Place | Step | RecordCommand
+Report = Status | Walks | SensedFrames | Entered | LiveFrame

@@ -25,14 +25,14 @@ from lgmdjax.viewer.messages import (
     RANDOM_ROOM,
     Controls,
     Entered,
-    Keep,
     Live,
     LiveFrame,
     Move,
     Open,
     Place,
+    RecordCommand,
     Report,
-    Senses,
+    SensedFrames,
     Status,
     Step,
     Walks,
@@ -54,7 +54,7 @@ class Viewer:
         self.simulator, self.out, self.run_folder = Simulator(), out, run
         self.playing = Playing()
         self.playback: Playback | None = None
-        self.is_live, self.keeps, self.contacts = False, False, 0
+        self.is_live, self.is_recording, self.contacts = False, False, 0
         self.opened: Open | None = None
         self.names: tuple[str, ...] = ()
         self.index, self.sensed, self._shown_frame = 0, 0, -1
@@ -79,8 +79,8 @@ class Viewer:
 
     def start_live(self) -> None:
         """Start the live simulation in the room that the controls name."""
-        if self.keeps:
-            self._keep()
+        if self.is_recording:
+            self._toggle_recording()
         self.live_panel.set_paused(False)
         self.status.content = "**live: starting**"
         room = Live(self.live_panel.room.value, int(self.live_panel.seed.value), self.run_folder)
@@ -124,7 +124,7 @@ class Viewer:
                     self._fail(text)
             case Walks():
                 self.play(report.playback, report.names, report.index)
-            case Senses():
+            case SensedFrames():
                 self._add_senses(report)
             case Entered():
                 self._enter(report)
@@ -169,9 +169,9 @@ class Viewer:
             panel.set_paused(True)
             self.simulator.send(Step())
 
-        @panel.keep.on_click
+        @panel.record.on_click
         def _(_: object) -> None:
-            self._keep()
+            self._toggle_recording()
 
         @panel.place.on_click
         def _(_: object) -> None:
@@ -190,12 +190,12 @@ class Viewer:
         if self.simulator.runs:
             self.simulator.send(controls)
 
-    def _keep(self) -> None:
+    def _toggle_recording(self) -> None:
         """Start to record, or stop and write the recording."""
-        self.keeps = not self.keeps
-        self.live_panel.keep.label = "Stop and write" if self.keeps else "Record"
+        self.is_recording = not self.is_recording
+        self.live_panel.record.label = "Stop and write" if self.is_recording else "Record"
         folder = self.out / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        self.simulator.send(Keep(True) if self.keeps else Keep(False, folder))
+        self.simulator.send(RecordCommand(True) if self.is_recording else RecordCommand(False, folder))
 
     def _choose(self, walk: int) -> None:
         if self.opened is not None:
@@ -250,7 +250,7 @@ class Viewer:
         self.dashboard.show_curves(playback, frame)
         self.transport.show(float(playback.time[frame]))
 
-    def _add_senses(self, report: Senses) -> None:
+    def _add_senses(self, report: SensedFrames) -> None:
         """Store what the robot sensed in some frames of the present walk."""
         playback = self.playback
         if playback is None or self.is_live:
@@ -259,7 +259,7 @@ class Viewer:
         self.sensed = report.first + len(report.pictures)
 
     def _enter(self, entered: Entered) -> None:
-        self.is_live, self.contacts, self.keeps = True, 0, False
+        self.is_live, self.contacts, self.is_recording = True, 0, False
         self.transport.folder.visible = False
         self.scene.set_room(entered.shape, entered.centres)
         self.scene.enable_drag(lambda index, x, y: self.simulator.send(Move(index, x, y)))

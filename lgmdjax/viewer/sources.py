@@ -29,7 +29,7 @@ from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes
 from lgmdjax.simulation.episodes import Walk
 from lgmdjax.viewer import edits, live_step
-from lgmdjax.viewer.messages import Open, Report, Senses, Status, Walks
+from lgmdjax.viewer.messages import Open, Report, SensedFrames, Status, Walks
 from lgmdjax.viewer.walk_paths import find_walks
 from lgmdjax.world.arena import Arena
 
@@ -70,7 +70,7 @@ class WalkSource:
         """Return whether some frames are not rendered yet."""
         return self.done < len(self.walk)
 
-    def sense(self) -> Senses:
+    def sense(self) -> SensedFrames:
         """Return what the robot sensed in the next frames."""
         walk, first = self.walk, self.done
         rows = np.minimum(np.arange(first, first + FRAMES_PER_CALL), len(walk) - 1)
@@ -87,11 +87,11 @@ class WalkSource:
             self.report(Status("recorded"))
         step = max(self.robot.camera.width // SHOWN_WIDTH, 1)
         pictures = np.asarray(senses.pictures)[:count, :, ::step, ::step]
-        return Senses(self.index, first, pictures, np.asarray(senses.layers)[:count])
+        return SensedFrames(self.index, first, pictures, np.asarray(senses.layers)[:count])
 
     def sense_all(self, frames: int) -> Playback:
         """Return the poses of the walk, and what the robot sensed in the first frames."""
-        parts: list[Senses] = []
+        parts: list[SensedFrames] = []
         while self.is_behind() and self.done < frames:
             parts.append(self.sense())
         pictures, layers = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pictures", "layers"))

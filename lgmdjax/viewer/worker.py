@@ -15,7 +15,7 @@ from typing import BinaryIO
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import program_cache
 from lgmdjax.viewer.live import LiveSimulation
-from lgmdjax.viewer.messages import Command, Controls, Keep, Live, Move, Open, Place, Report, Status, Step
+from lgmdjax.viewer.messages import Command, Controls, Live, Move, Open, Place, RecordCommand, Report, Status, Step
 from lgmdjax.viewer.sources import WalkSource
 
 IDLE = 0.05  # s between two checks for commands, while nothing is simulated
@@ -49,7 +49,7 @@ class Worker:
 
     def _turn(self) -> None:
         while not self.commands.empty():
-            self._obey(self.commands.get())
+            self._execute(self.commands.get())
         if self.live is not None and self.live.is_due():
             self.report(self.live.advance())
         elif self.source is not None and self.source.is_behind():
@@ -57,7 +57,7 @@ class Worker:
         else:
             time.sleep(IDLE if self.live is None else 0.001)
 
-    def _obey(self, command: Command) -> None:
+    def _execute(self, command: Command) -> None:
         match command:
             case Open():
                 self.live = self.source = None
@@ -71,8 +71,8 @@ class Worker:
                 self.controls = command
                 if self.live is not None:
                     self.live.steer(command)
-            case Move() | Place() | Step() | Keep() if self.live is not None:
-                self.live.obey(command)
+            case Move() | Place() | Step() | RecordCommand() if self.live is not None:
+                self.live.execute(command)
 
 
 def main() -> None:

@@ -167,7 +167,7 @@ def test_lerobot_statistics_are_those_of_the_data(lerobot: Path):
 def test_lerobot_videos_show_what_the_eyes_saw(run: Path, lerobot: Path):
     recording = recorded.read(run)
     with jax.enable_x64(False):
-        eyes, rooms = pictures.find_eyes(recording), pictures.find_rooms(recording)
+        eyes, rooms = pictures.find_camera(recording), pictures.find_rooms(recording)
         walk = recording.walks[1][: FRAMES - 5]
         expected = np.concatenate(list(pictures.render(eyes, rooms[1], walk)))
     stats = json.loads((lerobot / "meta" / "stats.json").read_text())

@@ -14,7 +14,7 @@ import pytest
 from lgmdjax.cli import main
 from lgmdjax.errors import InputError
 from lgmdjax.hardware import live_source
-from lgmdjax.hardware.camera_reader import Eyes
+from lgmdjax.hardware.camera_reader import StereoReader
 from lgmdjax.hardware.clock import Clock
 from lgmdjax.hardware.simulated_robot import PictureServer
 from lgmdjax.reporting import video_io
@@ -57,7 +57,7 @@ def stream() -> Iterator[Stream]:
     made.close()
 
 
-def take(eyes: Eyes) -> np.ndarray:
+def take(eyes: StereoReader) -> np.ndarray:
     end = time.monotonic() + 60
     while (frame := eyes.take(0.5)) is None:
         assert time.monotonic() < end
@@ -65,7 +65,7 @@ def take(eyes: Eyes) -> np.ndarray:
 
 
 def test_side_by_side_pictures_of_a_stream_are_the_two_eyes_and_the_newest_wins(stream: Stream) -> None:
-    with Eyes((stream.server.address,), (), EYE, Clock()) as eyes:
+    with StereoReader((stream.server.address,), (), EYE, Clock()) as eyes:
         left, right = take(eyes)
         assert np.ptp(left) == 0 and left[0, 0] == 255 - right[0, 0]
         before = int(left[0, 0])
@@ -79,10 +79,10 @@ def test_side_by_side_pictures_of_a_stream_are_the_two_eyes_and_the_newest_wins(
 
 def test_two_sources_are_taken_together_and_a_single_one_serves_both(stream: Stream) -> None:
     address = stream.server.address
-    with Eyes((address, address), (), camera.Params(width=80, height=30), Clock()) as eyes:
+    with StereoReader((address, address), (), camera.Params(width=80, height=30), Clock()) as eyes:
         both = take(eyes)
         assert both.shape == (2, 30, 80) and abs(int(both[0, 0, 0]) - int(both[1, 0, 0])) <= 3
-    with Eyes((address,), (), camera.Params(width=80, height=30), Clock(), mono=True) as eyes:
+    with StereoReader((address,), (), camera.Params(width=80, height=30), Clock(), mono=True) as eyes:
         left, right = take(eyes)
         np.testing.assert_array_equal(left, right)
 
@@ -92,7 +92,7 @@ def test_a_pipe_and_a_file_are_sources(tmp_path: Path) -> None:
     with video_io.open_writer(path, 80, 30, 30) as write:
         for number in range(12):
             write(pair(10 * number)[..., None].repeat(3, axis=-1))
-    with Eyes((str(path),), (), EYE, Clock()) as eyes:
+    with StereoReader((str(path),), (), EYE, Clock()) as eyes:
         assert take(eyes).shape == (2, 30, 40)
     fifo = tmp_path / "pipe"
     os.mkfifo(fifo)
@@ -104,7 +104,7 @@ def test_a_pipe_and_a_file_are_sources(tmp_path: Path) -> None:
 
     writer = threading.Thread(target=fill, daemon=True)
     writer.start()
-    with Eyes((str(fifo),), (), EYE, Clock()) as eyes:
+    with StereoReader((str(fifo),), (), EYE, Clock()) as eyes:
         assert take(eyes)[:, 0, 0].tolist() == [7, 248]
     writer.join(10)
 
@@ -116,7 +116,7 @@ def test_sources_that_do_not_fit_are_one_line(stream: Stream, tmp_path: Path) ->
         ((str(tmp_path / "none.mp4"),), EYE, "found no file"),
         (("tcp://127.0.0.1:9",), EYE, "does not open"),
     ):
-        with pytest.raises(InputError) as error, Eyes(sources, (), eye, clock):
+        with pytest.raises(InputError) as error, StereoReader(sources, (), eye, clock):
             pass
         assert words in str(error.value) and "\n" not in str(error.value)
 

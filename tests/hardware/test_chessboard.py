@@ -97,11 +97,11 @@ def test_the_lens_that_took_the_pictures_is_found(
 def test_what_is_left_of_straight_lines_tells_a_good_lens_from_a_bad_one(tmp_path: Path) -> None:
     folder = save_pictures(tmp_path / "pictures", "fisheye")
     found = chessboard.calibrate(folder, BOARD, "fisheye")
-    left = np.sqrt(np.mean(chessboard.bends(found) ** 2))
+    left = np.sqrt(np.mean(chessboard.row_deviations(found) ** 2))
     flat = Lens(model="pinhole", size=SIZE, K=found.lens.K, D=np.zeros(4))
     bent = chessboard.Calibration(lens=flat, error=0.0, corners=found.corners, used=found.used, unused=())
     assert np.rad2deg(left) < 0.1
-    assert np.sqrt(np.mean(chessboard.bends(bent) ** 2)) > 5 * left
+    assert np.sqrt(np.mean(chessboard.row_deviations(bent) ** 2)) > 5 * left
 
 
 @pytest.mark.parametrize(

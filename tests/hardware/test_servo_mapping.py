@@ -20,7 +20,7 @@ from lgmdjax.hardware.clock import Clock
 from lgmdjax.hardware.joint_map import JOINT_NAMES, JointMap
 from lgmdjax.hardware.servo_bus import ServoBus
 from lgmdjax.hardware.servo_mapping import Mapper
-from lgmdjax.hardware.simulated_servos import Bank
+from lgmdjax.hardware.simulated_servos import ServoBank
 
 TRUE = replace(
     joint_map.default(),
@@ -34,7 +34,7 @@ class Bench:
     """Servos on a pseudo-terminal, which go at once where they are told to."""
 
     def __init__(self, ids: tuple[int, ...]):
-        self.bank, (self._file, self._slave) = Bank(ids), os.openpty()
+        self.bank, (self._file, self._slave) = ServoBank(ids), os.openpty()
         tty.setraw(self._slave)
         self.port, self._ended = os.ttyname(self._slave), threading.Event()
         self.moves: list[tuple[int, int]] = []  # servo, and by how many positions

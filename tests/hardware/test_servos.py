@@ -10,11 +10,11 @@ import pytest
 
 from lgmdjax.errors import InputError
 from lgmdjax.hardware import ax_servo, joint_map, servo_bus
-from lgmdjax.hardware.ax_servo import Address, Fault
+from lgmdjax.hardware.ax_servo import Address, StatusError
 from lgmdjax.hardware.clock import Clock
 from lgmdjax.hardware.servo_bus import BusLost, ServoBus
 from lgmdjax.hardware.simulated_robot import Terminal
-from lgmdjax.hardware.simulated_servos import Bank, checksum
+from lgmdjax.hardware.simulated_servos import ServoBank, checksum
 
 
 def packet(servo: int, instruction: int, *parameters: int) -> bytes:
@@ -22,7 +22,7 @@ def packet(servo: int, instruction: int, *parameters: int) -> bytes:
     return b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
 
 
-def answers(bank: Bank, sent: bytes) -> list[str]:
+def answers(bank: ServoBank, sent: bytes) -> list[str]:
     return [answer.content.hex(" ") for answer in bank.receive(sent)]
 
 
@@ -37,18 +37,18 @@ def answers(bank: Bank, sent: bytes) -> list[str]:
     ],
 )
 def test_examples_of_the_manual(sent: str, expected: list[str]) -> None:
-    bank = Bank((1,))
+    bank = ServoBank((1,))
     bank.servos[1].write_entry(Address.PRESENT_TEMPERATURE, 32)
     assert answers(bank, bytes.fromhex(sent)) == expected
 
 
 def test_errors_are_bits_of_the_answer() -> None:
-    bank = Bank((1, 2))
+    bank = ServoBank((1, 2))
     errors = {
-        Fault.CHECKSUM: packet(1, 1)[:-1] + b"\x00",
-        Fault.INSTRUCTION: packet(1, 0x55),
-        Fault.RANGE: packet(1, 2, 48, 3),
-        Fault.ANGLE: packet(1, 3, Address.GOAL_POSITION, 0x20, 0x03),
+        StatusError.CHECKSUM: packet(1, 1)[:-1] + b"\x00",
+        StatusError.INSTRUCTION: packet(1, 0x55),
+        StatusError.RANGE: packet(1, 2, 48, 3),
+        StatusError.ANGLE: packet(1, 3, Address.GOAL_POSITION, 0x20, 0x03),
     }
     bank.servos[1].write_entry(Address.HIGHEST_POSITION, 700)
     for fault, sent in errors.items():
@@ -58,13 +58,13 @@ def test_errors_are_bits_of_the_answer() -> None:
     assert answers(bank, packet(1, 3, Address.MOVING_SPEED, 0, 8)) == ["ff ff 01 02 08 f4"]  # 2048: out of range
     assert bank.servos[1].entry(Address.MOVING_SPEED) == 0
     bank.servos[1].write_entry(Address.PRESENT_TEMPERATURE, 71)
-    assert bank.receive(packet(1, 1))[0].content[4] == Fault.OVERHEATING
+    assert bank.receive(packet(1, 1))[0].content[4] == StatusError.OVERHEATING
     bank.shut_down()
     assert [servo.entry(Address.TORQUE_LIMIT) for servo in bank.servos.values()] == [0, 1023]
 
 
 def test_registered_writes_wait_for_the_action_and_sync_writes_do_not() -> None:
-    bank = Bank((1, 2))
+    bank = ServoBank((1, 2))
     bank.receive(packet(1, 4, Address.GOAL_POSITION, 0, 2))
     assert (bank.servos[1].entry(Address.GOAL_POSITION), bank.servos[1].entry(Address.REGISTERED)) == (0, 1)
     bank.receive(packet(254, 5))
@@ -77,16 +77,16 @@ def test_registered_writes_wait_for_the_action_and_sync_writes_do_not() -> None:
 def test_the_parser_finds_the_next_packet_after_damage_whatever_the_pieces() -> None:
     stream = b"\x00\xff" + packet(1, 1) + b"\xff\xff\xff\x01" + packet(2, 1) + packet(1, 1)[:3]
     for size in (1, 2, 3, 7, 100):
-        bank = Bank((1, 2))
+        bank = ServoBank((1, 2))
         heard = [a.content[2] for k in range(0, len(stream), size) for a in bank.receive(stream[k : k + size])]
         assert heard[0] == 1 and heard[-1] == 2
     assert checksum(b"\x01\x02\x01") == 0xFB
 
 
 @pytest.fixture
-def terminal() -> Iterator[tuple[Terminal, Bank, list[bytes]]]:
+def terminal() -> Iterator[tuple[Terminal, ServoBank, list[bytes]]]:
     """Eighteen servos on a pseudo-terminal, answered by a thread; the list may hold what they answer instead."""
-    plug, bank, spoil = Terminal(), Bank(tuple(range(1, 19))), list[bytes]()
+    plug, bank, spoil = Terminal(), ServoBank(tuple(range(1, 19))), list[bytes]()
     ended = threading.Event()
 
     def serve() -> None:

@@ -54,12 +54,12 @@ def test_a_robot_without_faults_has_the_exported_nervous_system(robot):
     pictures = np.clip(np.round(smooth), 0, 255).astype(np.float32)
     responses = []
     for picture in pictures:
-        state = nervous_systems.see_batch(robot, none, state, picture[None], ranges)
+        state = nervous_systems.process_picture_batch(robot, none, state, picture[None], ranges)
         single, output = step(exported, single, picture.astype(np.uint8))
         responses.append(np.asarray(output.u))
         np.testing.assert_allclose(state.controller.velocity[0], output.velocity, atol=1e-5)
         for substep in range(SUBSTEPS):
-            state, targets = nervous_systems.move_batch(robot, none, state)
+            state, targets = nervous_systems.next_targets_batch(robot, none, state)
             np.testing.assert_allclose(targets[0], output.targets[substep], atol=1e-4)
     assert np.ptp(responses) > 0.01  # the pictures move the detectors
 

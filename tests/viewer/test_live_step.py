@@ -122,20 +122,20 @@ def test_a_kept_walk_is_read_with_every_move_of_an_obstacle(room, robot, tmp_pat
     films = []
     monkeypatch.setattr("lgmdjax.reporting.walk_video.write_trace", lambda *arguments: films.append(arguments))
     record = synthetic.walk(1, 30)
-    kept = edits.Kept(room.arena)
+    recording = edits.LiveRecording(room.arena)
     arena = room.arena
     for frame in range(30):
         if frame in (10, 11, 20):
             arena = edits.move(arena, 2, 0.1 * frame, -1.0)
-        kept.append(jax.tree.map(lambda leaf, frame=frame: leaf[0, frame], record), centres_of(arena))
-    folder = kept.write(tmp_path / "kept", robot, "learned", {"room": "random", "seed": 0})
+        recording.append(jax.tree.map(lambda leaf, frame=frame: leaf[0, frame], record), centres_of(arena))
+    folder = recording.write(tmp_path / "kept", robot, "learned", {"room": "random", "seed": 0})
     assert [path.name for path in folder.glob("*.parquet")] == ["chunk-00000.parquet"]
     from lgmdjax.simulation import episodes
 
     live_header = episodes.read_parameters(folder)["live"]
     read, centres = edits.read_edits(live_header, 30, folder)
-    np.testing.assert_allclose(centres, np.stack(kept.centres), rtol=1e-6)
+    np.testing.assert_allclose(centres, np.stack(recording.centres), rtol=1e-6)
     np.testing.assert_allclose(read.boxes.half_size, room.arena.boxes.half_size, rtol=1e-6)
     assert films[0][2].bounds.shape == (30, 4)  # the film has the room of each frame
     with pytest.raises(Exception, match="expected an empty or a new folder"):
-        kept.write(folder, robot, "learned", {"room": "random", "seed": 0})
+        recording.write(folder, robot, "learned", {"room": "random", "seed": 0})
