@@ -1,11 +1,11 @@
-# make setup | demo | reproduce | test | coverage | docs | lint | clean   (PYTHON=... and VENV=... choose another interpreter, another place)
+# make setup | demo | reproduce | test | test-extended | coverage | docs | lint | clean   (PYTHON=... and VENV=... choose another interpreter, another place)
 
 VENV ?= .venv
 SCALE ?= quick
 SEED ?= 0
 .DEFAULT_GOAL := setup
 .DELETE_ON_ERROR:
-.PHONY: setup demo reproduce test coverage docs lint clean lock
+.PHONY: setup demo reproduce test test-extended coverage docs lint clean lock
 
 # The first interpreter that runs and is new enough; a name alone proves nothing (version managers leave shims).
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -41,8 +41,12 @@ ifdef ARGS
 	'$(VENV)/bin/python' -m pytest $(ARGS)
 else
 	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m default_xla
-	'$(VENV)/bin/python' -m pytest -m 'not default_xla'
+	'$(VENV)/bin/python' -m pytest -m 'not default_xla and not extended'
 endif
+
+# What `make test` leaves out: gradients of batches, long derivatives, and the slowest notebook.
+test-extended: setup
+	'$(VENV)/bin/python' -m pytest -m extended
 
 # Lines that the tests reach, as a table and in build/coverage; needs half again as long as `make test`.
 coverage: setup

@@ -1,14 +1,15 @@
 """Settings of all tests: double precision, checked shapes, a compilation cache that outlives the run.
 
 Set LGMDJAX_TEST_DEFAULT_XLA=1 to compile with XLA's default flags, as users do. `make test` does so for the tests that
-are marked `default_xla`, and runs the others without it.
+are marked `default_xla`, and runs the others without it: with XLA's older code generator and, unless they are marked
+`optimised`, with few optimisations, so that they compile in half the time.
 """
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from lgmdjax.runtime.jax_setup import prepare_opengl
+from lgmdjax.runtime.jax_setup import collect_garbage_rarely, prepare_opengl
 
 # As variables, and before JAX is imported anywhere: processes that a test starts must find the same cache.
 ROOT = Path(__file__).parent.parent
@@ -38,6 +39,8 @@ DEFAULT_XLA_FILES = (
     "test_behaviour.py",
     "test_conftest.py",
 )
+# Files that use the programs of the smoke run, so they come after it.
+AFTER_SMOKE_RUN = ("test_run_trial.py", "test_studies_small.py", "test_docs.py", "test_notebooks.py")
 
 import jax
 import jaxtyping
@@ -45,6 +48,7 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
+collect_garbage_rarely()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -63,14 +67,36 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if is_other and config.getoption("markexpr") == "default_xla" else None
 
 
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One process more than cores: a process is idle while it waits for another, a file or a clock."""
+    return (os.cpu_count() or 1) + 1
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests for XLA's default flags; run files with slow tests first, so that none is left at the end."""
+    """Mark tests for XLA's default flags; order files by how long they take, so that no slow one is left at the end."""
     for item in items:
         if item.path.name in DEFAULT_XLA_FILES:
             item.add_marker("default_xla")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+
+    def rank(item: pytest.Item) -> int:
+        if item.path.name == "test_stages.py":
+            return 0
+        if item.path.name in AFTER_SMOKE_RUN:
+            return 2
+        return 1 if item.path in slow else 3
+
+    items.sort(key=rank)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_optimisations(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Compile with few optimisations, which most tests run too briefly to profit from; but see above."""
+    is_optimised = DEFAULT_XLA or request.node.get_closest_marker("optimised") is not None
+    jax.config.update("jax_disable_most_optimizations", not is_optimised)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture

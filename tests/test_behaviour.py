@@ -20,7 +20,7 @@ from lgmdjax.world import scenes
 SECONDS = 30.0
 
 
-TEXTURES = 3
+TEXTURES = 2
 PLAIN_WALL = "wall without contrast"
 KINDS = {
     "box to the left": partial(small_rooms.box_ahead, lateral=0.35),  # in the way, and only on its left

@@ -16,6 +16,7 @@ from nbformat import NotebookNode
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+EXTENDED = ("04_gradients",)  # its gradients take minutes to compile
 MAX_BYTES = 2**20  # of all notebooks together
 RELATIVE, ABSOLUTE = 1e-2, 1e-3
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
@@ -78,7 +79,10 @@ def test_notebook_is_committed_in_normal_form(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.extended] if p.stem in EXTENDED else []) for p in NOTEBOOKS],
+)
 def test_notebook_gives_the_committed_outputs(path):
     """With the flags of conftest.py, with which other tests have compiled the rollout."""
     committed, executed = code_cells(nbformat.read(path, as_version=4)), code_cells(execute.execute(path))

@@ -15,7 +15,7 @@ from lgmdjax.sensors import camera
 from lgmdjax.simulation import closed_loop, rollout, room_batches
 from lgmdjax.world import scenes
 
-pytestmark = pytest.mark.usefixtures("float32")
+pytestmark = [pytest.mark.optimised, pytest.mark.usefixtures("float32")]
 TEACHER = braitenberg.Params()
 RULE = {"base": 1.2, "full_turn": 0.0, "tie_tolerance": 0.0, "corridor": 0.0}  # eq. 22, limited to the gait's range
 

@@ -11,6 +11,8 @@ from lgmdjax.body import hexapod
 from lgmdjax.evaluation import gait_test
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping
 
+pytestmark = pytest.mark.optimised
+
 STEP = 1 / 180
 CYCLE = round(cpg.CYCLE_TIME / STEP)
 

@@ -17,6 +17,8 @@ from lgmdjax.errors import InputError
 from lgmdjax.locomotion import kinematics, tripod_gait
 from lgmdjax.world import arena
 
+pytestmark = pytest.mark.optimised
+
 STEPS = 18  # 0.1 s, of one call of `run`
 ROBOTS = 6
 MOTION = ["time", "ctrl", "qpos", "qvel", "xpos", "xquat", "xmat", "xipos", "geom_xpos", "geom_xmat", "site_xpos"]

@@ -13,6 +13,8 @@ from mujoco import mjx
 from lgmdjax.body import hexapod, implicit_step
 from lgmdjax.errors import InputError
 
+pytestmark = pytest.mark.optimised
+
 STEPS = 25
 
 
@@ -52,6 +54,7 @@ def test_equals_mjx_to_the_last_bit(targets):
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_derivatives_of_25_steps_with_soft_contacts_agree(model, targets):
     """Those of acceleration and forces too, whose values are the solver's own."""

@@ -178,6 +178,7 @@ def test_joint_commands_move_the_joints_that_they_name(vector):
     assert change[5, 0] > 0.05 and change[5, 0] == change.max()
 
 
+@pytest.mark.extended
 def test_the_derivative_of_a_reward_is_that_of_central_differences(robot):
     """Through three frames of physics and the laser's scan, by the commanded velocities."""
     environment = functional.make(robot=robot, room=rooms(FREE), observation="laser", reward="floor")

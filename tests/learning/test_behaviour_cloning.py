@@ -16,6 +16,8 @@ from lgmdjax.runtime import tracking
 from lgmdjax.simulation import sharding
 from lgmdjax.simulation.episodes import Walk
 
+pytestmark = pytest.mark.optimised
+
 EPOCHS = 20  # the same in most tests, so that they share one compiled program
 
 

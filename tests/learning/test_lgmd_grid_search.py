@@ -15,6 +15,8 @@ from lgmdjax.simulation import rerender
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record
 from lgmdjax.world import arena
 
+pytestmark = pytest.mark.optimised
+
 CANDIDATES = lgmd_grid_search.Candidates(threshold=np.array([0.5, 2.0, 8.0]), inhibition=np.array([0.4, 0.2, 0.4]))
 MAX_FF = 5.0  # grey, largest FF of the synthetic walks
 

@@ -148,6 +148,7 @@ def batch_gradient(params, model, rooms):
     return run
 
 
+@pytest.mark.extended
 @pytest.mark.slow
 def test_the_gradient_through_the_body_is_complete_without_rendering(params, batch_gradient, rolled_out):
     """It equals central differences, and reaches the legs, since the label depends on where the robot is.
@@ -169,6 +170,7 @@ def test_the_gradient_through_the_body_is_complete_without_rendering(params, bat
     assert all(np.any(leaf != 0) for leaf in jax.tree.leaves((grad.shaping, grad.cpg.cycle_time)))
 
 
+@pytest.mark.extended
 def test_a_batch_has_the_mean_gradient_of_its_finite_robots(batch_gradient, rolled_out):
     """One robot of four is not finite and is left out; gradients are clipped to the median norm."""
     end = rolled_out[1]
@@ -212,6 +214,7 @@ def finetune(params, model, rooms, batch_gradient, tmp_path):
     return run
 
 
+@pytest.mark.extended
 def test_fine_tuning_changes_trainable_parameters_and_reports_every_window(params, finetune):
     """By about the learning rate, as Adam does; scaling constants stay; one program serves all windows."""
     program: Any = rollout_gradient.gradient
@@ -229,6 +232,7 @@ def test_fine_tuning_changes_trainable_parameters_and_reports_every_window(param
     assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (before.policy, after.policy)), strict=True))
 
 
+@pytest.mark.extended
 def test_interrupted_fine_tuning_resumes_after_its_last_room(finetune, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         finetune(interrupt_after=3)

@@ -128,6 +128,7 @@ def test_another_seed_in_the_same_folder_is_refused_in_one_line(out, capsys):
     assert "seed" in stderr and stderr.count("\n") == 1
 
 
+@pytest.mark.extended
 def test_a_stage_with_a_damaged_episode_is_done_again(run, tmp_path):
     copy = tmp_path / "smoke"
     shutil.copytree(run, copy)

@@ -10,6 +10,8 @@ from lgmdjax.control import policies
 from lgmdjax.sensors import camera
 from lgmdjax.simulation import closed_loop, episodes, rerender, rollout, room_batches
 
+pytestmark = pytest.mark.optimised
+
 ROBOTS = 4  # two on each device
 CAMERA = camera.Params(width=80, height=60, overlap=0.6, ground=0.5)
 FRAMES = 45  # more than one call of the rendering program, and less than two

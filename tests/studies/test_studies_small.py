@@ -24,7 +24,7 @@ from lgmdjax.studies import errata, supervision
 from lgmdjax.studies.settings import SupervisionSettings
 from lgmdjax.world import scenes
 
-pytestmark = pytest.mark.usefixtures("float32")
+pytestmark = [pytest.mark.optimised, pytest.mark.usefixtures("float32")]
 EYES = CameraSettings(width=80, height=60, pooling=3, ground=0.5, falloff=2.0)  # of the pretrained robot
 SECONDS = 4.0
 
