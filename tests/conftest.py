@@ -92,8 +92,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_optimisations(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Compile with few optimisations, which most tests run too briefly to profit from; but see above."""
-    is_optimised = DEFAULT_XLA or request.node.get_closest_marker("optimised") is not None
+    """Compile with few optimisations: most tests run too briefly to profit from more. Marked files get them all."""
+    is_marked = request.node.get_closest_marker("optimised") is not None
+    is_optimised = is_marked or request.path.name in DEFAULT_XLA_FILES
     jax.config.update("jax_disable_most_optimizations", not is_optimised)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
