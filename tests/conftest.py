@@ -94,7 +94,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def few_optimisations(request: pytest.FixtureRequest) -> Iterator[None]:
     """Compile with few optimisations: most tests run too briefly to profit from more. Marked files get them all."""
     is_marked = request.node.get_closest_marker("optimised") is not None
-    is_optimised = is_marked or request.path.name in DEFAULT_XLA_FILES
+    is_optimised = DEFAULT_XLA or is_marked or request.path.name in DEFAULT_XLA_FILES
     jax.config.update("jax_disable_most_optimizations", not is_optimised)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
