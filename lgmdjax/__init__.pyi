@@ -17,6 +17,7 @@ from . import runtime as runtime
 from . import sensors as sensors
 from . import simulation as simulation
 from . import studies as studies
+from . import sweeps as sweeps
 from . import transfer as transfer
 from . import viewer as viewer
 from . import world as world

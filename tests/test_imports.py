@@ -11,6 +11,7 @@ from lgmdjax.paths import PACKAGE_DIR
 WINGS = (
     "cli",
     "viewer",
+    "sweeps",
     "pipeline",
     "studies",
     "datasets",

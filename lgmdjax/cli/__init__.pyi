@@ -11,6 +11,7 @@ from . import main as main
 from . import servos as servos
 from . import sim_robot as sim_robot
 from . import study as study
+from . import sweep as sweep
 from . import tracking as tracking
 from . import trial as trial
 from . import view as view

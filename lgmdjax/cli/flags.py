@@ -168,6 +168,28 @@ class BenchFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SweepFlags:
+    """The file of the sweep, and where its runs are executed."""
+
+    file: tyro.conf.Positional[Path]
+    """TOML file with the command, its flags and seeds, and the measures; docs/howto/sweep.md describes it"""
+    out: Path = Path("runs/sweeps")
+    """folder that holds the folders of the sweeps"""
+    name: str = ""
+    """name of the sweep's folder; that of the file if left out"""
+    workers: int = 1
+    """number of runs at once on this machine; each uses all cores that it finds"""
+    submitit: Literal["slurm", "local"] | None = None
+    """run jobs by submitit (extra `cluster`): on a SLURM cluster, or on this machine to try it"""
+    minutes: int = 120
+    """longest duration of a job of submitit [min]"""
+    cores: int = 2
+    """number of cores of a job of submitit"""
+    partition: str = ""
+    """partition of SLURM; its default if left out"""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExportFlags:
     """The robot, and where its nervous system is written."""
 
@@ -301,6 +323,11 @@ def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
 def parse_bench(description: str, arguments: Sequence[str]) -> BenchFlags:
     """Read the flags of command bench."""
     return parse(BenchFlags(on=tyro.MISSING), "bench", description, arguments)
+
+
+def parse_sweep(description: str, arguments: Sequence[str]) -> SweepFlags:
+    """Read the flags of command sweep."""
+    return parse(SweepFlags(file=tyro.MISSING), "sweep", description, arguments)
 
 
 def parse_dataset(description: str, arguments: Sequence[str]) -> DatasetFlags:

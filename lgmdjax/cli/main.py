@@ -90,6 +90,17 @@ def study(arguments: Sequence[str]) -> None:
     print(f"results in {run_study(name, given)}")
 
 
+def sweep(arguments: Sequence[str]) -> None:
+    """Run a command with many settings and seeds, here or on a cluster: table and figure with intervals."""
+    from lgmdjax.cli import flags
+
+    given = flags.parse_sweep(_summary(sweep), arguments)
+    environment.check_jax()
+    from lgmdjax.cli.sweep import run
+
+    print(f"results in {run(given)}")
+
+
 def watch(arguments: Sequence[str]) -> int:
     """Run the two looming detectors on a video: responses of each frame, alarms, plot, overlay video."""
     from lgmdjax.cli import flags
@@ -226,6 +237,7 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], int | None]] = {
     "report": report,
     "trial": trial,
     "study": study,
+    "sweep": sweep,
     "watch": watch,
     "export": export,
     "export-dataset": export_dataset,

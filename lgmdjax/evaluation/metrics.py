@@ -21,7 +21,7 @@ A robot that turns on the spot has no collision. `Progress` separates it from on
 Works on host records (`rollout.rollout_chunks`) with axes (robot, frame).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -240,6 +240,19 @@ def bootstrap_mean(values: Float[ndarray, " robots"]) -> Estimate:
         (values,), np.mean, confidence_level=CONFIDENCE, n_resamples=2000, method="percentile", rng=0
     ).confidence_interval
     return Estimate(value=float(values.mean()), low=float(interval.low), high=float(interval.high))
+
+
+def student_mean(values: Sequence[float]) -> Estimate:
+    """Estimate a mean over independent runs, with Student's t interval; that of a single run is nan.
+
+    >>> print(student_mean([1.0, 2.0, 3.0]))
+    2 [-0.484, 4.48]
+    """
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return Estimate(value=mean, low=float("nan"), high=float("nan"))
+    half = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * stats.sem(values))
+    return Estimate(value=mean, low=mean - half, high=mean + half)
 
 
 def _average_over_cycle(series: Float[ndarray, "frames *components"], cycle_time: float) -> ndarray:

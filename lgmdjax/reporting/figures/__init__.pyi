@@ -5,4 +5,5 @@ from . import learning as learning
 from . import locomotion as locomotion
 from . import stimulus_scores as stimulus_scores
 from . import style as style
+from . import sweeps as sweeps
 from . import trajectories as trajectories

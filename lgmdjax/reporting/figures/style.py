@@ -19,6 +19,7 @@ palette of Okabe & Ito, which colour-blind readers can tell apart.
 | `comparison.plot_collision_rates`             | -            | collisions per 100 m of every policy, with intervals |
 | `comparison.plot_collisions_against_coverage` | -            | the same against the coverage of every policy        |
 | `stimulus_scores.plot`                        | -            | looming detectors on laboratory stimuli              |
+| `sweeps.plot`                                 | -            | measures of a sweep against its settings             |
 | `clip_scores.plot_roc`, `plot_clip`           | -            | looming detectors on video clips                     |
 """
 
