@@ -18,12 +18,14 @@ from jaxtyping import Array, Float
 from lgmdjax.simulation.closed_loop import Room
 from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.world import scenes
-from lgmdjax.world.arena import Arena, sample_free_poses
+from lgmdjax.world.arena import Arena, at_time, sample_free_poses
 
 START_COUNT = 32  # start poses of a room, used in order, a new one after each reset
 BENCHMARK_EPISODE = 2**23  # episode number of `benchmark_rooms`, above those of all training episodes
 CONTRAST_RANGE = (0.3, 1.0)  # factors by which the contrast of training rooms is scaled
 OVERHEAD_SHARE = 0.2  # of the obstacles in training rooms
+CROSSING_SHARE = 0.5  # probability that a box, and that a cylinder, moves into the way of the robot in a training room
+AT_REST = 60.0  # s; after it nothing moves in training rooms
 
 
 @partial(jax.jit, static_argnames="count")
@@ -77,13 +79,17 @@ def training_rooms(seed: int, episode: int, robots: int) -> Room:
     """
     key = jax.random.fold_in(jax.random.key(seed), episode)
     rooms = random_rooms(key, robots)
-    contrast_key, overhead_key = (jax.random.fold_in(key, robots + k) for k in range(2))
+    contrast_key, overhead_key, crossing_key, starts_key = (jax.random.fold_in(key, robots + k) for k in range(4))
     contrast = jax.random.uniform(contrast_key, (robots,), jnp.float32, *CONTRAST_RANGE)
 
-    def vary(arena: Arena, contrast: Array, key: Array) -> Arena:
-        return scenes.raise_obstacles(scenes.scale_contrast(arena, contrast), key, OVERHEAD_SHARE)
+    def vary(room: Room, contrast: Array, keys: Array) -> Room:
+        raised = scenes.raise_obstacles(scenes.scale_contrast(room.arena, contrast), keys[0], OVERHEAD_SHARE)
+        arena = scenes.cross_path(raised, room.starts[0], keys[1], CROSSING_SHARE)
+        later = sample_free_poses(keys[2], at_time(arena, AT_REST), START_COUNT - 1)
+        return replace(room, arena=arena, starts=jnp.concatenate([room.starts[:1], later]))
 
-    return replace(rooms, arena=jax.vmap(vary)(rooms.arena, contrast, jax.random.split(overhead_key, robots)))
+    keys = jnp.stack([jax.random.split(k, robots) for k in (overhead_key, crossing_key, starts_key)], axis=1)
+    return jax.vmap(vary)(rooms, contrast, keys)
 
 
 def benchmark_rooms(benchmark: BenchmarkRooms, seed: int, contrast: float = 1.0) -> Room:
