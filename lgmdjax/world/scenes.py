@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from lgmdjax.geometry import rotate
 from lgmdjax.world.arena import Arena, clearance, empty_room
-from lgmdjax.world.obstacles import CAPACITY, Prisms, concatenate, inactive, make_prisms, raise_prisms
+from lgmdjax.world.obstacles import CAPACITY, Prisms, concatenate, inactive, is_inactive, make_prisms, raise_prisms
 
 MIN_GAP = 0.8
 """Minimum gap between obstacles and around the start [m]: twice the width of the robot."""
@@ -31,6 +31,10 @@ GAP_BOX = 0.25
 """Half the side of the boxes of `gap_scene` [m]."""
 PLACEMENT_ATTEMPTS = 128
 """Number of positions that are tried for each obstacle of a random room."""
+WALKING_SPEED = 0.06
+"""Speed of a robot that nothing stands in the way of [m/s]; decides where `cross_path` meets it."""
+HALF_ROBOT = 0.25
+"""Half the length of the robot [m]."""
 
 # x, y, half sizes (a cylinder: radius twice) [m], yaw [deg], height [m].
 _TRAINING_BOXES = (
@@ -266,6 +270,45 @@ def raise_obstacles(arena: Arena, key: Array, share: Float[Array, ""] | float) -
         boxes=raise_prisms(arena.boxes, samples[:boxes], share),
         cylinders=raise_prisms(arena.cylinders, samples[boxes:], share),
     )
+
+
+def cross_path(arena: Arena, start: Float[Array, "3"], key: Array, share: Float[Array, ""] | float) -> Arena:
+    """Return the room in which a box and a cylinder may move into the straight path of a robot that leaves `start`.
+
+    Each does so with probability `share`. It comes from 1 to 2.5 m beside the path, departs 2 to 14 s after the robot,
+    moves for 1.5 to 3 s, and stops with its centre within 0.1 m of the path and its front 0.2 to 0.7 m before a robot
+    that has walked straight on at `WALKING_SPEED`. A motion that would begin or end outside the room is left out.
+
+    Args:
+        arena: the room, in which nothing moves yet.
+        start: pose (x, y, yaw) of the robot at time 0 [m, m, rad].
+        key: of the random numbers.
+        share: probability of each of the two motions.
+    """
+    samples = _sample_uniform(key, (2, 6))
+    boxes = _send_into_path(arena, arena.boxes, start, samples[0], share)
+    return dataclasses.replace(
+        arena, boxes=boxes, cylinders=_send_into_path(arena, arena.cylinders, start, samples[1], share)
+    )
+
+
+def _send_into_path(
+    arena: Arena, prisms: Prisms, start: Float[Array, "3"], samples: Float[Array, "6"], share: Float[Array, ""] | float
+) -> Prisms:
+    """Let the first prism cross the path as `cross_path` says, with numbers 0 .. 1 in `samples`."""
+    chosen, delay, pace, gap, aside, lateral = samples
+    departs, duration = 2 + 12 * delay, 1.5 + 1.5 * pace
+    ahead = WALKING_SPEED * (departs + duration) + HALF_ROBOT + 0.2 + 0.5 * gap + jnp.max(prisms.half_size[0])
+    side = jnp.where(aside < 0.5, -1.0, 1.0)
+    goal = start[:2] + rotate(jnp.stack([ahead, 0.2 * lateral - 0.1]), start[2])
+    from_side = 1.0 + 1.5 * jnp.abs(2 * aside - 1)
+    origin = goal + rotate(jnp.stack([jnp.zeros_like(side), side * from_side]), start[2])
+    both = jnp.stack([origin, goal])
+    is_inside = jnp.all((both > arena.bounds[0::2]) & (both < arena.bounds[1::2]))
+    moves = (chosen < share) & is_inside & ~is_inactive(prisms)[0]
+    motion = {"centre": origin, "goal": goal, "departs": departs, "arrives": departs + duration}
+    changed = {name: getattr(prisms, name).at[0].set(value) for name, value in motion.items()}
+    return jax.tree.map(lambda new, old: jnp.where(moves, new, old), dataclasses.replace(prisms, **changed), prisms)
 
 
 def scale_contrast(arena: Arena, contrast: ArrayLike) -> Arena:
