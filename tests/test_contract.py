@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, PyTree
 
-from lgmdjax.control import braitenberg, controller, names, navigator, policies
+from lgmdjax.control import braitenberg, compass, controller, names, navigator, policies
 from lgmdjax.detectors import d_lgmd, dsn, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, tau
 from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.locomotion import cpg, shaping
@@ -84,6 +84,12 @@ def observations(_: np.random.Generator) -> policies.Observation:
     return policies.Observation(u=u, feed_forward=zero, excitation=zero, distances=zero, corridor=zero)
 
 
+def commands_and_headings(_: np.random.Generator) -> tuple[Array, Array]:
+    """Commands and headings [rad], one of them far from the wanted one, after a turn."""
+    velocities = jnp.asarray([[1.0, 1.3], [1.0, 1.0], [1.1, 1.0], [1.0, 1.0]], dtype=float)
+    return velocities, jnp.asarray([0.1, 0.2, 1.5, -0.3], dtype=float)
+
+
 EMD_GAIN = (".motion.gain",)  # of the correlators as a detector of their own
 
 
@@ -122,6 +128,13 @@ def detector(module: Any, params: Callable[[], PyTree], zero_gradient: tuple[str
 # compiled anyway, test_closed_loop checks that its state can be scanned and that chunks of a batch equal the rollout of
 # one robot, and test_rollout_gradient checks that both modes agree in every parameter of the controller.
 COMPONENTS = (
+    Component(
+        "compass",
+        lambda: compass.Params(drift=0.1),
+        lambda params, first: compass.init(params, first[1], jnp.ones_like(first[1])),
+        lambda params, state, now: compass.step(params, state, *now, 1 / 30),
+        commands_and_headings,
+    ),
     Component("lgmd", smooth_lgmd, lgmd.init, lgmd.step, noise(12, 16)),
     Component(
         "lgmd-hard",

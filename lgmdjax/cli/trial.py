@@ -29,4 +29,5 @@ def describe(outcome: JsonObject) -> str:
         coverage = outcome["progress"]["coverage"]["value"]
         return f"{outcome['collisions']} collisions in {outcome['distance']:.0f} m, {coverage:.1f} new cells a minute"
     untouched = f"{outcome['untouched']} of {outcome['robots']} untouched"
-    return f"{untouched}; {outcome['passed']} passed, {outcome['retreated']} turned back"
+    line = f"{untouched}; {outcome['passed']} passed, {outcome['retreated']} turned back"
+    return f"{line}; SPL {outcome['spl']['value']:.2f}" if "spl" in outcome else line

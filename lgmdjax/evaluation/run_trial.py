@@ -90,8 +90,7 @@ def run_trial(
     ```
     """
     _check(trial, policy, seeds)
-    robot = _load_robot(run, width)
-    definition = trials.TRIALS[trial]
+    robot, definition = equip(_load_robot(run, width), trial), trials.TRIALS[trial]
     trial_run = describe_run(robot, trial, policy, seeds or definition.seeds, definition.seconds)
 
     def work(folder: Path, inputs: Mapping[str, Path], settings: JsonObject, seed: int) -> None:
@@ -114,6 +113,11 @@ def _check(trial: str, policy: str, seeds: int | None) -> None:
             raise InputError(f"expected the name of a {kind}, got {name!r}; choose one of {', '.join(known)}")
     if seeds is not None and seeds < 1:
         raise InputError(f"expected one or more --seeds, got {seeds}; leave it out for as many as the paper has")
+
+
+def equip(robot: closed_loop.Params, trial: str) -> closed_loop.Params:
+    """Return the robot with what a trial gives it: a compass if the robot keeps a heading."""
+    return assembly.with_compass(robot) if trials.TRIALS[trial].keeps_heading else robot
 
 
 def describe_run(
@@ -158,6 +162,18 @@ def summarise(trial: trials.Trial, record: Record) -> JsonObject:
         "progress": asdict(metrics.progress(trials.truncate_at_end(record, outcome))),
         "clearance": outcome.clearance.tolist(),
         "seconds": (outcome.frames / FRAME_RATE).tolist(),
+        **(_summarise_way(outcome) if trial.keeps_heading else {}),
+    }
+
+
+def _summarise_way(outcome: trials.Outcome) -> JsonObject:
+    """Summarise the ways of robots with a compass: SPL, distance, and touches per 100 m."""
+    distance = float(outcome.walked.sum())
+    touches = metrics.poisson_rate(int(outcome.touched.sum()), max(distance, 1e-9) / 100)
+    return {
+        "spl": asdict(metrics.bootstrap_mean(outcome.spl)),
+        "distance": distance,
+        "touches_per_100_m": asdict(touches),
     }
 
 

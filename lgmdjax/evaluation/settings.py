@@ -7,8 +7,9 @@ from lgmdjax.control.names import POLICY_NAMES, PolicyName
 from lgmdjax.sensors.settings import Resolution
 
 TrialName = Literal[
-    "testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "gap", "gap-70cm", "gap-60cm", "white", "corner"
-]
+    "testing", "unseen", "tube", "indoor", "outdoor", "dynamic", "gap", "gap-70cm", "gap-60cm", "traverse", "pocket",
+    "white", "corner",
+]  # fmt: skip
 """The trials of `lgmdjax.evaluation.trials`, in the order of its `TRIALS`."""
 
 

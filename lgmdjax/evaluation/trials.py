@@ -9,6 +9,8 @@
 | outdoor  | fig. 15b          | trees and bushes on grass, a facade behind them                |
 | dynamic  | figs. 15c, 16b, c | boxes that move in from the left, then from the right          |
 | gap      | -                 | two boxes ahead, 0.8 m apart; also 0.7 m and 0.6 m             |
+| traverse | -                 | random, in a room of 12 x 6 m, to cross with a compass         |
+| pocket   | sec. 6            | three walls of a U around the robot, with a compass            |
 | white    | sec. 5.4          | a wall without contrast ahead                                  |
 | corner   | sec. 5.4          | a corner of two walls ahead                                    |
 
@@ -22,6 +24,7 @@ degrees. No training room uses the textures' random key. Every second seed mirro
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +33,11 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy import ndarray
 
 from lgmdjax import geometry
+from lgmdjax.evaluation import metrics
 from lgmdjax.evaluation.metrics import Estimate, wilson_proportion
 from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.html import NotebookTable
+from lgmdjax.locomotion import cpg
 from lgmdjax.simulation import finite, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.world import arena, scenes
@@ -42,6 +47,8 @@ TUBE_DISTANCE = 1.25  # d_x of fig. 14 [m]
 TRIAL_EPISODE = 2**22  # folded into the seed's key; far from the episode numbers of a run, whose rooms therefore differ
 START_JITTER = (0.01, 0.01, np.deg2rad(2.0))  # largest offset of a start pose: x, y [m], yaw [rad]
 GAP_JITTER = (0.2, 0.2, np.deg2rad(15.0))  # the same before a gap
+POCKET_JITTER = (0.1, 0.1, np.deg2rad(15.0))  # the same in a pocket
+TRAVERSE_END = 5.0  # m, x at which a room has been crossed
 TURN_BACK_ANGLE = 0.5 * np.pi  # rad from the first heading
 
 
@@ -60,6 +67,7 @@ class Trial(NotebookTable):
     beyond: float = np.inf  # m; a robot with a greater x has passed the obstacle
     lateral_offsets: tuple[float, ...] = ()  # m, of the obstacle; every seed has each of them to the left and the right
     ends_at_contact: bool = True  # otherwise the robot is reset and walks on
+    keeps_heading: bool = False  # the robot has a compass and returns to its first heading (`control.compass`)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +80,8 @@ class Outcome(NotebookTable):
     passed: Bool[ndarray, " robots"]  # passed the obstacle without contact
     retreated: Bool[ndarray, " robots"]  # turned back without contact, and did not pass
     made_good: Float[ndarray, " robots"]  # m/s, distance towards what is behind the obstacle over time
+    walked: Float[ndarray, " robots"]  # m, length of the path until the end, averaged over a cycle of the gait
+    spl: Float[ndarray, " robots"]  # success weighted by path length (Anderson et al. 2018), with the straight line
 
     def avoided(self) -> Estimate:
         """Estimate the proportion of robots without contact, with Wilson's interval."""
@@ -99,6 +109,8 @@ def find_outcome(trial: Trial, record: Record) -> Outcome:
     at_end = (np.arange(len(end)), end)
     until_end = np.arange(x.shape[1]) <= end[:, None]
     touched, passed = has_failed[at_end], (is_beyond & ~has_failed)[at_end]
+    walked = np.where(until_end, metrics.step_lengths(record, cpg.CYCLE_TIME), 0.0).sum(axis=1)
+    straight = trial.beyond - x[:, 0]  # no path is shorter
     return Outcome(
         touched=touched,
         frames=end + 1,
@@ -106,6 +118,8 @@ def find_outcome(trial: Trial, record: Record) -> Outcome:
         passed=passed,
         retreated=(has_turned & until_end).any(axis=1) & ~touched & ~passed,
         made_good=(x[at_end] - x[:, 0]) * FRAME_RATE / (end + 1),
+        walked=walked,
+        spl=np.divide(straight, np.maximum(walked, straight), out=np.zeros(len(end)), where=passed),
     )
 
 
@@ -125,6 +139,18 @@ def _repeat_scene(
         return room_batches.stack_rooms([_room(scene, key, bool(n % 2), jitter) for n, key in enumerate(keys)])
 
     return make_rooms
+
+
+@partial(jax.jit, static_argnames="seeds")
+def _traverse_rooms(key: Array, seeds: int) -> Room:
+    """Build a random room to cross for each seed."""
+
+    def room(key: Array) -> Room:
+        built = scenes.traverse_room(key)
+        starts = jnp.tile(built.start, (room_batches.START_COUNT, 1))
+        return Room(arena=built, starts=starts, key=jax.random.fold_in(key, 1))
+
+    return jax.vmap(lambda n: room(jax.random.fold_in(key, n)))(jnp.arange(seeds))
 
 
 def _tube_rooms(key: Array, seeds: int) -> Room:
@@ -252,6 +278,30 @@ TRIALS: dict[str, Trial] = {
         _gap_trial("gap", 0.8),
         _gap_trial("gap-70cm", 0.7),
         _gap_trial("gap-60cm", 0.6),
+        Trial(
+            name="traverse",
+            title="a room to cross",
+            source="-",
+            paper="not done",
+            caption="Each robot has a compass and crosses a random room of 12 x 6 m, 10 m along its first heading.",
+            make_rooms=_traverse_rooms,
+            seeds=40,
+            seconds=300.0,
+            beyond=TRAVERSE_END,
+            keeps_heading=True,
+        ),
+        Trial(
+            name="pocket",
+            title="a pocket",
+            source="sec. 6",
+            paper="future work",
+            caption="Each robot starts in a U of three walls, facing its closed end; its compass points beyond it.",
+            make_rooms=_repeat_scene(scenes.pocket_scene, POCKET_JITTER),
+            seeds=10,
+            seconds=240.0,
+            beyond=1.5,
+            keeps_heading=True,
+        ),
         Trial(
             name="white",
             title="a white wall",

@@ -67,7 +67,7 @@ def _record(
 ) -> closed_loop.Record:
     """Record one policy in one trial, or read its walks if they are on disk."""
     coarse = None if policy == "learned" else plan.coarse
-    robot = assembly.with_resolution(robot, coarse or plan.eyes)
+    robot = run_trial.equip(assembly.with_resolution(robot, coarse or plan.eyes), plan.trial)
     seconds = plan.seconds or trials.TRIALS[plan.trial].seconds
     trial_run = run_trial.describe_run(robot, plan.trial, policy, plan.seeds, seconds)
     return run_trial.record_trial(folder / plan.trial / policy, trial_run, robot, seed)[1]

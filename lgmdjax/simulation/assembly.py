@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lgmdjax.control import braitenberg, navigator, policies
+from lgmdjax.control import braitenberg, compass, navigator, policies
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
@@ -162,6 +162,16 @@ def scale_resolution(robot: closed_loop.Params, width: int) -> Resolution:
         )
     height, cell = camera.height * width // camera.width, pooling * width // camera.width
     return Resolution(width=width, height=height, pooling=cell)
+
+
+def with_compass(params: closed_loop.Params, steering: compass.Params | None = None) -> closed_loop.Params:
+    """Return the robot with a compass: it returns to the heading of its start, whatever its policy.
+
+    Raises InputError for invalid numbers.
+    """
+    steering = steering or compass.Params()
+    compass.check(steering)
+    return replace(params, heading=jax.tree.map(lambda value: jnp.asarray(value, float), steering))
 
 
 def with_policy(params: closed_loop.Params, name: PolicyName, policy_params: PyTree) -> closed_loop.Params:

@@ -26,7 +26,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lgmdjax.body import hexapod
-from lgmdjax.control import braitenberg, controller
+from lgmdjax.control import braitenberg, compass, controller
 from lgmdjax.control.policies import Observation, Policy
 from lgmdjax.detectors import lgmd
 from lgmdjax.html import NotebookTable
@@ -56,6 +56,7 @@ class Params(NotebookTable):
     laser: laser.Params
     frame_stride: Int[Array, ""] | None = None  # frames from one picture to the next, 1 if None; u is held in between
     head_sway: Float[Array, ""] | None = None  # sway of the head, as a multiple of the trunk's, 1 if None
+    heading: compass.Params | None = None  # of a robot that keeps the heading of its start; None for one without a goal
 
 
 @struct.dataclass(kw_only=True)
@@ -77,6 +78,7 @@ class State:
     data: mjx.Data
     controller: controller.State
     teacher: braitenberg.State
+    heading: compass.State | None  # None without `Params.heading`
     response: lgmd.Response  # of both LGMDs to the last picture
     frame: Int[Array, ""]  # frames since the start of the rollout
     resets: Int[Array, ""]  # number of resets so far
@@ -166,6 +168,7 @@ def init(params: Params, model: mjx.Model, room: Room, policy: Policy) -> State:
         data=hexapod.init(model, room.starts[0]),
         controller=controller.init(params.controller, black, policy, room.key),
         teacher=braitenberg.init(params.teacher),
+        heading=_init_heading(params, room, jnp.asarray(0, jnp.int32)),
         response=lgmd.Response(
             u=jnp.full(2, lgmd.U_AT_REST, float), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2)
         ),
@@ -227,6 +230,7 @@ def reset(params: Params, room: Room, state: State, policy: Policy) -> State:
         data=hexapod.reset(state.data, start),
         controller=replace(state.controller, policy=policy_state),
         teacher=braitenberg.init(params.teacher),
+        heading=_init_heading(params, room, resets),
         resets=resets,
         is_first=jnp.ones_like(state.is_first),
     )
@@ -291,8 +295,27 @@ def decide(params: Params, state: State, observation: Observation, policy: Polic
     distances = braitenberg.sensed_distances(params.teacher, observation.distances, observation.corridor)
     _, label = braitenberg.step(params.teacher, state.teacher, distances)
     controller_state = controller.decide(params.controller, state.controller, observation, policy)
-    teacher = braitenberg.track_turn(params.teacher, controller_state.velocity)
-    return replace(state, controller=controller_state, teacher=teacher), label
+    state = _steer(params, replace(state, controller=controller_state))
+    teacher = braitenberg.track_turn(params.teacher, state.controller.velocity)
+    return replace(state, teacher=teacher), label
+
+
+def _init_heading(params: Params, room: Room, resets: Int[Array, ""]) -> compass.State | None:
+    """Return the state in which the robot keeps the heading of its start; the drift of its sensor is random."""
+    if params.heading is None:
+        return None
+    start = jnp.take(room.starts, resets, axis=0, mode="wrap")
+    sign = jax.random.uniform(jax.random.fold_in(room.key, resets), (), start.dtype, -1.0, 1.0)
+    return compass.init(params.heading, start[2], sign)
+
+
+def _steer(params: Params, state: State) -> State:
+    """Add the turn towards the heading that the robot keeps, if it keeps one, to the velocity of the policy."""
+    if params.heading is None or state.heading is None:
+        return state
+    yaw, velocity = hexapod.yaw(hexapod.pose(state.data)), state.controller.velocity
+    kept, velocity = compass.step(params.heading, state.heading, velocity, yaw, 1 / FRAME_RATE)
+    return replace(state, heading=kept, controller=replace(state.controller, velocity=velocity))
 
 
 def move(

@@ -144,17 +144,34 @@ def gap_scene(width: ArrayLike, key: Array | None = None, *, contrast: ArrayLike
     return scale_contrast(with_random_textures(room, key), contrast)
 
 
+def traverse_room(key: Array, *, contrast: ArrayLike = 1.0) -> Arena:
+    """Sample a room of 12 x 6 m with 0.2 obstacles per square metre; the start faces the far wall, 11.2 m away."""
+    y = 2.0 * _sample_uniform(jax.random.fold_in(key, 1), ()) - 1.0
+    start = jnp.stack([jnp.full_like(y, -5.2), 1.5 * y, jnp.zeros_like(y)])
+    return random_room(key, 0.2, size=(12.0, 6.0), start=start, contrast=contrast)
+
+
+def pocket_scene(key: Array | None = None, *, contrast: ArrayLike = 1.0) -> Arena:
+    """Build a U of three walls, 1.5 m wide and 1.5 m deep inside, around a start that faces its closed end."""
+    walls = ((0.95, 0.0, 0.05, 0.85, 0.0, 0.8), (0.15, 0.8, 0.75, 0.05, 0.0, 0.8), (0.15, -0.8, 0.75, 0.05, 0.0, 0.8))
+    room = empty_room((7.0, 6.0), boxes=_prisms_from_rows(walls))
+    return scale_contrast(with_random_textures(room, key), contrast)
+
+
 def random_room(
     key: Array,
     density: ArrayLike = 0.25,
     *,
+    size: ArrayLike | None = None,
+    start: ArrayLike | None = None,
     contrast: ArrayLike = 1.0,
     min_gap: float = MIN_GAP,
     max_boxes: int = CAPACITY,
     max_cylinders: int = CAPACITY,
 ) -> Arena:
-    """Sample a room of 6 to 8 m a side with `density` obstacles per square metre, boxes and cylinders in alternation.
+    """Sample a room with `density` obstacles per square metre, boxes and cylinders in alternation.
 
+    `size` is x, y [m], by default 6 to 8 m a side, and `start` a pose, by default a random one.
     Obstacles are at least `min_gap` [m] from each other and from the walls, and `MIN_GAP` from the start. The start is
     therefore free, and every other free place can be reached. An obstacle for which `PLACEMENT_ATTEMPTS` positions fail
     is left out: count the others with `obstacles.is_inactive`. Rooms are full at about 0.25 per square metre.
@@ -168,8 +185,9 @@ def random_room(
     rounds = max(max_boxes, max_cylinders)
     # One call for all; its last row is for the room itself. A call takes longer to compile than to run.
     samples = _sample_uniform(room_key, (rounds + 1, 2, 4 + 2 * PLACEMENT_ATTEMPTS))
-    size = 6.0 + 2.0 * samples[-1, 0, :2]
-    start = (2.0 * samples[-1, 1, :3] - 1.0) * jnp.append(0.5 * size - MIN_GAP, jnp.pi)
+    size = 6.0 + 2.0 * samples[-1, 0, :2] if size is None else jnp.asarray(size, dtype=float)
+    if start is None:
+        start = (2.0 * samples[-1, 1, :3] - 1.0) * jnp.append(0.5 * size - MIN_GAP, jnp.pi)
     arena = empty_room(size, boxes=inactive(max_boxes), cylinders=inactive(max_cylinders), start=start)
     wanted = jnp.asarray(density, dtype=float) * size[0] * size[1]
 

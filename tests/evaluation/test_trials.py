@@ -12,7 +12,7 @@ from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.world import arena, scenes
 
 KEY = jax.random.key(8)
-SCENES = ("tube", "indoor", "outdoor", "dynamic", "gap", "gap-60cm", "white", "corner")
+SCENES = ("tube", "indoor", "outdoor", "dynamic", "gap", "gap-60cm", "pocket", "white", "corner")
 TUBE = trials.TRIALS["tube"]
 
 
@@ -32,7 +32,8 @@ def test_rooms_are_valid_and_starts_are_near_those_of_the_paper(rooms, name):
     arena.validate(batch.arena)
     np.testing.assert_array_equal(batch.starts[:, 0], batch.arena.start)
     expected = np.array([0, 0, np.pi / 4 if name == "corner" else 0])
-    jitter = trials.GAP_JITTER if name.startswith("gap") else trials.START_JITTER
+    jitters = {"gap": trials.GAP_JITTER, "gap-60cm": trials.GAP_JITTER, "pocket": trials.POCKET_JITTER}
+    jitter = jitters.get(name, trials.START_JITTER)
     assert np.all(np.abs(np.abs(batch.arena.start) - expected) <= np.array(jitter) + 1e-12)
     assert len(np.unique(batch.arena.start[:, 0])) > 1
 
@@ -119,3 +120,33 @@ def test_frames_after_the_end_of_a_trial_are_no_progress():
     assert summary["passed"] == 2 and summary["passing"]["value"] == 1
     assert summary["made_good"]["value"] == pytest.approx(0.05, rel=0.01)
     assert summary["progress"]["hard_turning"]["value"] == 0
+
+
+def test_rooms_to_cross_have_a_way_from_a_free_start_towards_their_end():
+    rooms = trials.TRIALS["traverse"].make_rooms(KEY, 3)
+    arena.validate(rooms.arena)
+    np.testing.assert_allclose(rooms.arena.bounds, [[-6, 6, -3, 3]] * 3)
+    np.testing.assert_array_equal(rooms.starts[:, 0], rooms.arena.start)
+    np.testing.assert_allclose(rooms.arena.start[:, ::2], [[-5.2, 0]] * 3)
+    assert len(np.unique(rooms.arena.start[:, 1])) == 3
+    present = np.asarray(rooms.arena.boxes.top > 0).sum(1) + np.asarray(rooms.arena.cylinders.top > 0).sum(1)
+    assert np.all(present >= 12)  # 0.2 for each of the 72 square metres are 14; some find no place
+
+
+def test_success_is_weighted_by_the_length_of_the_path():
+    """One robot walks straight on, one a triangle wave of 45 degrees, and one touches something on its way."""
+    trial = trials.TRIALS["traverse"]
+    frames = 9000
+    position = np.zeros((3, frames, 3))
+    position[..., 0] = -5.2 + 0.06 * np.arange(frames) / 30
+    position[1, :, 1] = np.abs((0.06 * np.arange(frames) / 30) % 2 - 1)
+    contact = np.zeros((3, frames), bool)
+    contact[2, 3000] = True
+    outcome = trials.find_outcome(trial, walk(3, frames, position=position, contact=contact))
+    assert outcome.passed.tolist() == [True, True, False]
+    np.testing.assert_allclose(outcome.walked[:2], [10.2, 10.2 * np.sqrt(2)], rtol=0.01)
+    np.testing.assert_allclose(outcome.spl, [1, 1 / np.sqrt(2), 0], rtol=0.01)
+    summary = run_trial.summarise(trial, walk(3, frames, position=position, contact=contact))
+    assert summary["touches_per_100_m"]["value"] == pytest.approx(100 / outcome.walked.sum())
+    assert summary["spl"]["value"] == pytest.approx(outcome.spl.mean())
+    assert "spl" not in run_trial.summarise(TUBE, walk())
