@@ -24,6 +24,7 @@ class TrainSettings(DaggerSettings):
     split_half_epochs: int = 80  # number of epochs of the fit to the teacher's walks split in halves, as in the paper
     variants: tuple[str, ...] = ("lstm", "lstm-efference", "feed-forward", "mean")  # networks to fit and compare
     turn_gains: tuple[float, ...] = ()  # turn gains to compare by walking; none: behaviour_cloning.TURN_GAIN
+    turn_gain_seconds: float = 120.0  # simulated time of each robot with each gain [s]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -121,6 +121,8 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
                 TrialPlan(trial="gap", eyes=_QUICK, seeds=40),
                 TrialPlan(trial="gap-70cm", eyes=_QUICK, seeds=40),
                 TrialPlan(trial="gap-60cm", eyes=_QUICK, seeds=40),
+                TrialPlan(trial="traverse", eyes=_QUICK, seeds=40),
+                TrialPlan(trial="pocket", eyes=_QUICK, seeds=10),
                 TrialPlan(trial="white", eyes=_QUICK, seeds=12),
                 TrialPlan(trial="corner", eyes=_QUICK, seeds=12),
             )
