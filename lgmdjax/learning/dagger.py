@@ -120,7 +120,8 @@ def select_turn_gain(
         robot: the robot that walks.
         fit: its navigator.
         test: segments on which the navigator's turns are measured.
-        settings: the gains, and how many robots walk for how long with each. Without gains no robot walks and `TURN_GAIN` holds.
+        settings: the gains, and how many robots walk for how long with each. Without gains no robot walks, and
+            `TURN_GAIN` holds.
         seed: of the rooms.
 
     Returns:

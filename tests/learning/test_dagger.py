@@ -97,7 +97,7 @@ def test_an_approach_ends_when_the_robot_is_twice_as_far_away():
 
 
 def test_the_smallest_turn_gain_with_nearly_the_fewest_approaches_is_selected(recorded, tmp_path, monkeypatch):
-    """Over the same distance there are 8, 6 and 4 approaches, of which 4 + 2 are as few; with no choice no robot walks."""
+    """Over the same distance there are 8, 6 and 4 approaches, of which 4 + 2 are as few; without gains none walks."""
     approaches = {1.5: 8, 2.0: 6, 2.5: 4}
 
     def record_rollouts(folder, learner, rooms, seconds, policy, *, parameters, **_):
