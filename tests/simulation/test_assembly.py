@@ -83,7 +83,8 @@ def test_fingerprint_depends_on_every_number_and_on_the_camera(robot):
 
 
 def test_another_detector_is_part_of_the_robot(robot):
-    for model in (emd, dsn):
+    models: tuple[Any, ...] = (emd, dsn)
+    for model in models:
         other = assembly.with_detector(robot, model)
         assert other.controller.detector_model is model
         assert jax.tree.structure(other.controller.detector) == jax.tree.structure(model.Params())
