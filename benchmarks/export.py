@@ -199,7 +199,9 @@ def prepare(folder: Path, width: int, formats: list[str]) -> None:
     policy, networks = controller.policy, controller.shaping
     weights = {name: getattr(policy, name) for name in ("input_mean", "input_scale", "output_mean", "output_scale")}
     weights |= {name: getattr(networks, name) for name in ("w1", "b1", "w2", "b2")}
-    weights |= {name: getattr(controller.lgmd, name) for name in ("kernel", "inhibition", "threshold", "suppression")}
+    weights |= {
+        name: getattr(controller.detector, name) for name in ("kernel", "inhibition", "threshold", "suppression")
+    }
     cell, head = policy.weights["cell"], policy.weights["head"]
     weights |= {"dense_i": cell["dense_i"]["kernel"], "dense_h": cell["dense_h"]["kernel"]}
     weights |= {"bias": cell["dense_h"]["bias"], "head": head["kernel"], "head_bias": head["bias"]}

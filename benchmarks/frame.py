@@ -23,7 +23,7 @@ import numpy as np
 from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, policies
 from lgmdjax.sensors import camera
-from lgmdjax.simulation import closed_loop, rollout, room_batches, sharding
+from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches, sharding
 
 RESOLUTIONS = ((320, 240, 60.0), (160, 120, 240.0))  # width, height [px], target [robot-frames/s]
 FRAMES = 10  # of a measured rollout
@@ -32,7 +32,7 @@ REPEATS = 5
 
 def assemble_robot(width: int, height: int) -> closed_loop.Params:
     """Return a robot with the teacher as its policy, whose camera renders the whole picture."""
-    return closed_loop.assemble(braitenberg.Params(), camera_params=camera.Params(width=width, height=height))
+    return assembly.assemble(braitenberg.Params(), camera_params=camera.Params(width=width, height=height))
 
 
 def measure(params: closed_loop.Params, robots: int) -> tuple[float, float]:

@@ -93,6 +93,8 @@ def _rows(value: object, name: str, comment: str = "") -> Iterator[tuple[str, st
 def _leaf(value: object) -> str:
     """Return the text of a number or a short array; of a long array its dtype, shape and range."""
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if inspect.ismodule(value):
+        return value.__name__
     if shape is None or dtype is None:
         return f"{value:.6g}" if isinstance(value, float) else str(value)
     described = f"{dtype}{list(shape)}"

@@ -67,7 +67,8 @@ def test_the_robot_of_a_run_folder_is_loaded():
     np.testing.assert_array_equal(robot.controller.policy.policies[1].output_scale, stored["output_scale"])
     assert not shaping.load(RUN / "fit-gait" / "shaping.safetensors").printed_input
     detector = assembly.load_detector(RUN / "collect")
-    assert float(detector.threshold) == float(robot.controller.lgmd.threshold)
+    assert float(detector.threshold) == float(robot.controller.detector.threshold)
+    assert assembly.fingerprint(robot) == "0e22c326052c2030"  # as version 0.2 computed it: walks name their robot by it
 
 
 def test_stages_do_not_resume_in_a_run_folder_of_version_0_1_0(tmp_path):

@@ -17,7 +17,7 @@ import pytest
 from jaxtyping import Array, PyTree
 
 from lgmdjax.control import braitenberg, compass, controller, names, navigator, policies
-from lgmdjax.detectors import d_lgmd, dsn, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, tau
+from lgmdjax.detectors import d_lgmd, dsn, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, scaled, tau
 from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.locomotion import cpg, shaping
 
@@ -66,7 +66,7 @@ def smooth_lgmd() -> lgmd.Params:
 def learned_controller() -> controller.Params:
     """With one Runge-Kutta step per frame: four take long to compile, and are tested with the CPG."""
     return controller.Params(
-        lgmd=smooth_lgmd(),
+        detector=smooth_lgmd(),
         policy=navigator.create(jax.random.key(1)),
         cpg=cpg.Params(substeps=1),
         shaping=shaping.init(jax.random.key(2)),
@@ -165,6 +165,7 @@ COMPONENTS = (
     detector(emd, emd.Params),
     detector(grm, grm.Params, EMD_GAIN),
     detector(lplc2, lambda: replace(lplc2.create(5), intercept=0.3, inhibition_intercept=-0.01), EMD_GAIN),
+    detector(scaled, lambda: scaled.Params(detector=smooth_lgmd(), contrast=1.2, pooling=2)),
     replace(detector(eta, eta.Params), inputs=looming_object),
     replace(detector(tau, tau.Params), inputs=looming_object),
     Component(

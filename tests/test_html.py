@@ -72,10 +72,9 @@ def test_a_tree_shows_values_and_the_comments_beside_its_fields():
 def test_parameters_of_the_robot_are_shown_with_units():
     robot = assembly.load_robot()
     rows = shown(robot)
-    threshold = float(robot.controller.lgmd.threshold)
-    assert (
-        rows["controller.lgmd.threshold"][1] == "T_s, grey" and float(rows["controller.lgmd.threshold"][0]) == threshold
-    )
+    threshold, row = float(robot.controller.detector.threshold), rows["controller.detector.threshold"]
+    assert row[1] == "T_s, grey" and float(row[0]) == threshold
+    assert rows["controller.detector_model"][0] == "lgmdjax.detectors.lgmd"
     assert len(rows) <= html.MAX_ROWS + 2
     assert shown(lj.lgmd.Params())["suppression"][1] == "T_f, grey"
 

@@ -12,7 +12,7 @@ from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, policies
 from lgmdjax.evaluation import metrics, trials
 from lgmdjax.sensors import camera
-from lgmdjax.simulation import closed_loop, rollout, room_batches
+from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches
 from lgmdjax.world import scenes
 
 pytestmark = [pytest.mark.optimised, pytest.mark.usefixtures("float32")]
@@ -22,7 +22,7 @@ RULE = {"base": 1.2, "full_turn": 0.0, "tie_tolerance": 0.0, "corridor": 0.0}  #
 
 def roll_out(rooms: closed_loop.Room, seconds: float, teacher: braitenberg.Params = TEACHER) -> closed_loop.Record:
     """Roll out eight robots with a teacher; one compiled program serves all tests."""
-    params = closed_loop.assemble(teacher, teacher_params=teacher, camera_params=camera.Params(width=16, height=12))
+    params = assembly.assemble(teacher, teacher_params=teacher, camera_params=camera.Params(width=16, height=12))
     chunks = rollout.rollout_chunks(params, hexapod.build(), rooms, policies.TEACHER, seconds, render=False)
     return rollout.concatenate_time(list(chunks))
 

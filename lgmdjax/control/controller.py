@@ -1,11 +1,12 @@
 """The robot's controller: stereo frame in, eighteen joint targets out.
 
-Two LGMDs process the two hemifields, a policy turns their outputs into a left and right velocity, and the output of
-the CPG, shaped for that velocity, becomes joint angles. There are two rates: `detect` and `decide` run once per camera
-frame, `move` once per physics substep. `step` composes them for a robot whose only sensor is the camera.
+Two looming detectors process the two hemifields, a policy turns their outputs into a left and right velocity, and the
+output of the CPG, shaped for that velocity, becomes joint angles. There are two rates: `detect` and `decide` run once
+per camera frame, `move` once per physics substep. `step` composes them for a robot whose only sensor is the camera.
 
 The policy is an argument (`lgmdjax.control.policies`), so that the learned navigator and the policies that it is
-compared with share the same detectors and gait.
+compared with share the same detectors and gait. The detector is a part of the parameters: any module or object with the
+interface of `lgmdjax.detectors.protocol`, the paper's LGMD by default.
 
 | symbol | name          | unit              | equation |
 | ------ | ------------- | ----------------- | -------- |
@@ -22,10 +23,13 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
 from lgmdjax.control.policies import Observation, Policy
-from lgmdjax.detectors import lgmd
+from lgmdjax.detectors import cells, lgmd, protocol
+from lgmdjax.detectors.protocol import Detector
+from lgmdjax.errors import InputError
 from lgmdjax.html import NotebookTable
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.sensors import hemifield
@@ -36,56 +40,90 @@ Frames = Float[Array, "2 height width"] | UInt8[Array, "2 height width"]
 
 @struct.dataclass(kw_only=True)
 class Params(NotebookTable):
-    """All parameters between camera and servos that can be differentiated."""
+    """All parameters between camera and servos that can be differentiated, and the detector that they are for."""
 
-    lgmd: lgmd.Params
+    detector: PyTree  # of the type that `detector_model` takes
     policy: PyTree  # of the type that the policy takes
     cpg: cpg.Params
     shaping: shaping.Params
+    detector_model: Detector = struct.field(pytree_node=False, default=lgmd)  # of both eyes; hashable, as modules are
 
 
 @struct.dataclass(kw_only=True)
 class State:
     """States of detectors, policy and CPG, and the velocity commanded last."""
 
-    lgmd: lgmd.State  # of both eyes, stacked
+    detector: PyTree  # of both eyes, stacked
     policy: PyTree
     cpg: cpg.State
     velocity: Float[Array, "2"]
 
 
+@struct.dataclass(kw_only=True)
+class Response:
+    """What a policy may use of both detectors' responses, left first."""
+
+    u: Float[Array, "2"]
+    feed_forward: Float[Array, "2"]  # zero for a detector without
+    excitation: Float[Array, "2"]
+
+
 def init(params: Params, frames: Frames, policy: Policy, key: Array) -> State:
     """Return the state at a first stereo frame: zero velocity, and the CPG on its limit cycle."""
     return State(
-        lgmd=init_lgmd(params, frames),
+        detector=init_detectors(params, frames),
         policy=policy.init(params.policy, key),
         cpg=cpg.limit_cycle_state(params.cpg),
         velocity=jnp.zeros(2),
     )
 
 
-def init_lgmd(params: Params, frames: Frames) -> lgmd.State:
-    """Return the states of both LGMDs at a first stereo frame, so that their first frame difference is zero."""
-    return jax.vmap(lgmd.init, in_axes=(None, 0))(params.lgmd, hemifield.outermost_first(frames))
+def init_detectors(params: Params, frames: Frames) -> PyTree:
+    """Return the states of both detectors at a first stereo frame, so that their first frame difference is zero."""
+    return jax.vmap(params.detector_model.init, in_axes=(None, 0))(params.detector, hemifield.outermost_first(frames))
 
 
-def detect(params: Params, state: State, frames: Frames) -> tuple[State, lgmd.Response]:
-    """Step both LGMDs by one stereo frame (eqs. 7-16); the response has one entry for each eye, left first."""
+def rest(dtype: DTypeLike = float) -> Response:
+    """Return the response of both detectors before they see anything."""
+    return Response(
+        u=jnp.full(2, cells.U_AT_REST, dtype), feed_forward=jnp.zeros(2, dtype), excitation=jnp.zeros(2, dtype)
+    )
+
+
+def detect(params: Params, state: State, frames: Frames) -> tuple[State, Response]:
+    """Step both detectors by one stereo frame (eqs. 7-16); the response has one entry for each eye, left first."""
     frames = hemifield.outermost_first(frames)
-    lgmd_state, response = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(params.lgmd, state.lgmd, frames)
-    return replace(state, lgmd=lgmd_state), response
+    step = jax.vmap(params.detector_model.step, in_axes=(None, 0, 0))
+    detector_state, own = step(params.detector, state.detector, frames)
+    response = Response(
+        u=own.u, feed_forward=getattr(own, "feed_forward", jnp.zeros_like(own.u)), excitation=own.excitation
+    )
+    return replace(state, detector=detector_state), response
 
 
-def detect_or_start(
-    params: Params, state: State, frames: Frames, is_first: Bool[Array, ""]
-) -> tuple[State, lgmd.Response]:
-    """Step both LGMDs as `detect` does; a first frame starts from the states of `init_lgmd`."""
-    started = init_lgmd(params, frames)
-    before = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), started, state.lgmd)
-    return detect(params, replace(state, lgmd=before), frames)
+def detect_or_start(params: Params, state: State, frames: Frames, is_first: Bool[Array, ""]) -> tuple[State, Response]:
+    """Step both detectors as `detect` does; a first frame starts from the states of `init_detectors`."""
+    started = init_detectors(params, frames)
+    before = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), started, state.detector)
+    return detect(params, replace(state, detector=before), frames)
 
 
-def observe_without_laser(response: lgmd.Response) -> Observation:
+def require_lgmd(params: Params, purpose: str) -> lgmd.Params:
+    """Return the parameters of the LGMD; raise `InputError` for a robot with another detector.
+
+    Args:
+        params: of the controller.
+        purpose: what needs the LGMD, as "the export to C".
+    """
+    if params.detector_model is not lgmd:
+        raise InputError(
+            f"expected a robot with the detector {protocol.name(lgmd)} for {purpose}, got one with "
+            f"{protocol.name(params.detector_model)}; only the LGMD is supported there"
+        )
+    return params.detector
+
+
+def observe_without_laser(response: Response) -> Observation:
     """Return the observation of a robot without a laser scanner: distances are zero, so no policy may need them."""
     return Observation(
         u=response.u,

@@ -49,7 +49,7 @@ def find_camera(recording: Recording) -> RecordedCamera:
     around = [folder for folder in recording.folder.resolve().parents if (folder / "train").is_dir()]
     runs = [folder for folder in around if (folder / "train" / "controller.safetensors").is_file()]
     robot = assembly.load_robot(runs[0] / "fit-gait", runs[0] / "train") if runs else assembly.load_robot()
-    return RecordedCamera(settings=assembly.camera_settings(robot), detector=robot.controller.lgmd)
+    return RecordedCamera(settings=assembly.camera_settings(robot), detector=robot.controller.detector)
 
 
 def find_rooms(recording: Recording) -> list[Arena]:

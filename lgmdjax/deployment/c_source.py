@@ -112,7 +112,7 @@ def sizes(params: Params) -> dict[str, int]:
 
 def private_sizes(params: Params) -> dict[str, tuple[int, str]]:
     """Return the other sizes, and a comment on each."""
-    seen, pooling = sizes(params), params.controller.lgmd.pooling
+    seen, pooling = sizes(params), params.controller.detector.pooling
     _, row_parts = cells.pooling_parts(seen["SEEN_ROWS"], pooling)
     _, column_parts = cells.pooling_parts(seen["SEEN_COLUMNS"], pooling)
     inputs = params.controller.policy.weights["cell"]["dense_i"]["kernel"].shape[0]
@@ -147,7 +147,7 @@ def constants(params: Params) -> list[Constant]:
 
 
 def _lgmd_constants(params: Params) -> Rows:
-    detector = params.controller.lgmd
+    detector = params.controller.detector
     _, columns = nervous_system.cell_shape(params)
     return [
         ("FRAME_RATE", FRAME_RATE, "Hz, of the camera"),
@@ -219,7 +219,7 @@ def _by_gate(kernel: Array) -> np.ndarray:
 
 def _check(params: Params) -> None:
     """Raise `InputError` for forms of the components that the C program does not support."""
-    detector, policy = params.controller.lgmd, params.controller.policy
+    detector, policy = params.controller.detector, params.controller.policy
     if not policy.variant.startswith("lstm"):
         raise InputError(f"expected an LSTM as the navigator for C, got {policy.variant}; export other formats")
     if detector.smooth or detector.printed_feed_forward or detector.printed_gate:

@@ -91,7 +91,7 @@ def _eyes(params: Params) -> JsonObject:
 
 
 def _lgmd(params: Params) -> JsonObject:
-    detector, (rows, columns) = params.controller.lgmd, nervous_system.cell_shape(params)
+    detector, (rows, columns) = params.controller.detector, nervous_system.cell_shape(params)
     return {
         "threshold": float(f"{detector.threshold:.7g}"),  # digits of single precision
         "suppression": float(f"{detector.suppression:.7g}"),

@@ -69,8 +69,10 @@ class Output:
 def from_robot(robot: closed_loop.Params) -> Params:
     """Return the nervous system of a robot with all five policies, as `assembly.load_robot` returns it.
 
-    Raises InputError for a robot that does not see in every frame (`frame_stride`), as in one study.
+    Raises InputError for a robot with another detector than the LGMD, and for one that does not see in every frame
+    (`frame_stride`), as in one study.
     """
+    controller.require_lgmd(robot.controller, "the export of its nervous system")
     if robot.frame_stride is not None:
         raise InputError(f"expected a robot that sees in every frame, got stride {robot.frame_stride}; set it to None")
     learned = robot.controller.policy.policies[policies.POLICIES.index(POLICY)]
@@ -102,7 +104,9 @@ def init(params: Params) -> State:
 def step(params: Params, state: State, pictures: UInt8[Array, "2 height width"]) -> tuple[State, Output]:
     """Process a stereo picture: detect, decide, and move for `SUBSTEPS` substeps."""
     frames = crop(params, pictures)
-    before = controller.State(lgmd=state.lgmd, policy=state.navigator, cpg=state.cpg, velocity=state.navigator.velocity)
+    before = controller.State(
+        detector=state.lgmd, policy=state.navigator, cpg=state.cpg, velocity=state.navigator.velocity
+    )
     seen, response = controller.detect_or_start(params.controller, before, frames, state.is_first)
     decided = controller.decide(params.controller, seen, controller.observe_without_laser(response), POLICY)
     moved, targets = move(params, decided)
@@ -160,4 +164,4 @@ def leaf_names(state: PyTree) -> list[str]:
 
 def _without_command(state: controller.State, is_first: Bool[Array, ""]) -> State:
     """Drop the commanded velocity, which the navigator's state has too."""
-    return State(lgmd=state.lgmd, navigator=state.policy, cpg=state.cpg, is_first=is_first)
+    return State(lgmd=state.detector, navigator=state.policy, cpg=state.cpg, is_first=is_first)

@@ -12,4 +12,5 @@ from . import lgmd2 as lgmd2
 from . import lplc2 as lplc2
 from . import on_off as on_off
 from . import protocol as protocol
+from . import scaled as scaled
 from . import tau as tau

@@ -6,18 +6,25 @@
 | init     | init(params, frame) -> state                                                                             |
 | step     | step(params, state, frame) -> (state, response), for one eye; scan and vmap are the caller's             |
 | Response | has `u`, 0.5 without motion and up to 1, and `excitation`, which is not squashed; other fields are free  |
+| check    | optional: check(params) raises `InputError` for impossible constants                                     |
 
 Every detector of this package has this interface, and so has the template of the page "Write your own detector". The
 ideal observers have it too, but get the object's true size instead of a frame.
 """
 
+import inspect
 from collections.abc import Callable
-from typing import Any, Protocol
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol, runtime_checkable
 
+import jax
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lgmdjax.detectors.cells import Scalar
+from lgmdjax.errors import InputError, one_line
+from lgmdjax.runtime import checksums
 
 
 class Response(Protocol):
@@ -30,6 +37,7 @@ class Response(Protocol):
     def excitation(self) -> Float[Array, ""]: ...
 
 
+@runtime_checkable
 class Detector(Protocol):
     """A looming detector of one eye; modules qualify."""
 
@@ -49,3 +57,63 @@ class Geometry:
 
     size: Scalar  # theta, the full angle [rad]
     rate: Scalar  # its derivative [rad/s]
+
+
+def name(detector: Detector) -> str:
+    """Return the name of a detector: that of its module or object, or of its type.
+
+    >>> from lgmdjax.detectors import emd
+    >>> name(emd)
+    'emd'
+    """
+    own: str = getattr(detector, "__name__", type(detector).__name__)
+    return own.removeprefix(f"{__package__}.")
+
+
+def identify(detector: Detector) -> str:
+    """Return a text that distinguishes a detector from all others: its name and, if it is your own, its source.
+
+    Raises `InputError` for a `step` that is not in a file.
+    """
+    if isinstance(detector, ModuleType) and detector.__name__.startswith(f"{__package__}."):
+        return name(detector)
+    try:
+        source = Path(inspect.getsourcefile(inspect.unwrap(detector.step)) or "").read_bytes()
+    except (OSError, TypeError) as error:
+        raise InputError(
+            f"detector {name(detector)}: expected a function step in a file, got none ({one_line(error)}); "
+            "save the detector as a module"
+        ) from error
+    return f"{name(detector)} {checksums.digest(source)}"
+
+
+def check(detector: Detector, params: PyTree, frame: jax.ShapeDtypeStruct) -> None:
+    """Raise `InputError` unless a detector can be scanned over frames like this one; nothing is computed.
+
+    Args:
+        detector: a module, or any object that is hashable.
+        params: its parameters, which its own `check` sees first if it has one.
+        frame: shape and type of a frame.
+    """
+    called = f"detector {name(detector)}"
+    try:
+        hash(detector)
+        getattr(detector, "check", lambda _: None)(params)
+        before = jax.eval_shape(detector.init, params, frame)
+        after, response = jax.eval_shape(detector.step, params, before, frame)
+        outputs = {part: getattr(response, part).shape for part in ("u", "excitation")}
+    except InputError:
+        raise
+    except Exception as error:  # whatever the code of a user raises
+        raise InputError(
+            f"{called}: expected init and step for a frame of {frame.dtype} {frame.shape}, got {one_line(error)}; "
+            "see lgmdjax.detectors.protocol"
+        ) from error
+    if jax.tree.structure(before) != jax.tree.structure(after) or _types(before) != _types(after):
+        raise InputError(f"{called}: expected a state like {before} after a step, got {after}; keep shapes and types")
+    if any(shape != () for shape in outputs.values()):
+        raise InputError(f"{called}: expected one u and one excitation a frame, got shapes {outputs}; reduce them")
+
+
+def _types(tree: PyTree) -> list[tuple[tuple[int, ...], Any]]:
+    return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]

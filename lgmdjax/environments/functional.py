@@ -268,6 +268,8 @@ def _check_rooms(rooms: Room) -> None:
             f"room: expected a batch of rooms, with starts of shape (rooms, starts, 3), got {np.shape(rooms.starts)}; "
             "put a single one into room_batches.stack_rooms([room])"
         )
+    if rooms.faults is not None:
+        raise InputError("room: expected rooms without camera faults, got some with; leave Room.faults out")
     x_min, x_max, y_min, y_max = np.moveaxis(np.asarray(rooms.arena.bounds), -1, 0)
     largest = float(max(np.max(x_max - x_min), np.max(y_max - y_min)))
     if largest > coverage.MAX_SIZE:

@@ -1,9 +1,9 @@
 """Finetune a controller while the robot walks, by the gradient of the imitation loss; measure its noise as well.
 
 Adam follows the mean gradient of a batch of robots (`lgmdjax.learning.rollout_gradient`), window after window and room
-after room. Each update is in units of `param_scales`. The constants of LGMD and CPG are multiplied by a factor, so that
-their sign is kept and zeros stay zero; weights are changed by addition. Left and right legs share their update, so that
-a mirror-symmetric gait stays symmetric.
+after room. Each update is in units of `param_scales`. The constants of detector and CPG are multiplied by a factor, so
+that their sign is kept and zeros stay zero; weights are changed by addition. Left and right legs share their update, so
+that a mirror-symmetric gait stays symmetric.
 
 | symbol | name   | unit                      | meaning                                                              |
 | ------ | ------ | ------------------------- | -------------------------------------------------------------------- |
@@ -34,7 +34,7 @@ from lgmdjax.runtime.mjx import mjx
 from lgmdjax.simulation import rollout
 from lgmdjax.simulation.closed_loop import Params, Record, Room, State
 
-MULTIPLICATIVE = ("lgmd", "cpg")  # parts of the controller whose constants are updated by a factor
+MULTIPLICATIVE = ("detector", "cpg")  # parts of the controller whose constants are updated by a factor
 
 Update = Callable[[controller.Params, optax.OptState, PyTree], tuple[controller.Params, optax.OptState]]
 
@@ -46,7 +46,7 @@ class Settings:
     learning_rate: float = 1e-3  # in units of param_scales; decays to zero along half a cosine
     windows_per_room: int = 30  # before the robots continue in other rooms
     rooms: int = 4  # of each robot, one after the other
-    trainable: tuple[str, ...] = ("policy",)  # parts of `controller.Params`, or leaves such as "lgmd.threshold"
+    trainable: tuple[str, ...] = ("policy",)  # parts of `controller.Params`, or leaves such as "detector.threshold"
 
 
 class WindowStats(NamedTuple):
@@ -126,7 +126,7 @@ def finetune(
 def param_scales(controller_params: controller.Params, trainable: tuple[str, ...]) -> controller.Params:
     """Return the scale in which each parameter is updated; zero if it is not trainable.
 
-    The scale of a constant of LGMD or CPG is its magnitude, that of a weight the root mean square of its array.
+    The scale of a constant of detector or CPG is its magnitude, that of a weight the root mean square of its array.
     Scaling constants of the navigator and widths of smooth thresholds are never trained.
 
     Raises InputError for a name in `trainable` that is not in the controller.
@@ -151,7 +151,7 @@ def param_scales(controller_params: controller.Params, trainable: tuple[str, ...
 def apply_update(
     controller_params: controller.Params, updates: controller.Params, param_scales: controller.Params
 ) -> controller.Params:
-    """Add updates in units of `param_scales` to weights; multiply the constants of LGMD and CPG by exp(update)."""
+    """Add updates in units of `param_scales` to weights; multiply the constants of detector and CPG by exp(update)."""
     added = jax.tree.map(lambda leaf, update, scale: leaf + update * scale, controller_params, updates, param_scales)
     multiplied = jax.tree.map(lambda leaf, update: leaf * jnp.exp(update), controller_params, updates)
     return replace(added, **{name: getattr(multiplied, name) for name in MULTIPLICATIVE})

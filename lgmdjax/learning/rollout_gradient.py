@@ -179,9 +179,13 @@ def learned_only(params: Params) -> Params:
 
 
 def smooth_thresholds(params: Params) -> Params:
-    """Return a robot whose LGMDs have differentiable thresholds of relative width `SMOOTH_WIDTH`."""
-    smoothed = lgmd.with_smooth_thresholds(params.controller.lgmd, SMOOTH_WIDTH)
-    return replace(params, controller=replace(params.controller, lgmd=smoothed))
+    """Return a robot whose LGMDs have differentiable thresholds of relative width `SMOOTH_WIDTH`.
+
+    Raises InputError for a robot with another detector.
+    """
+    own = controller.require_lgmd(params.controller, "smooth thresholds")
+    smoothed = lgmd.with_smooth_thresholds(own, SMOOTH_WIDTH)
+    return replace(params, controller=replace(params.controller, detector=smoothed))
 
 
 def _average(values: Float[Array, " robots"], grads: controller.Params, clip: float) -> Gradient:

@@ -59,7 +59,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: EvaluateSettings, se
     shown = _one(records["testing"]["learned"], selection.select_walk(records["testing"]["learned"]))
     write_arrays(folder / "walk.npz", {name: getattr(shown, name) for name in episodes.FIELDS})
     resolution = next(plan.eyes for plan in settings.trials if plan.trial == "testing")
-    write_arrays(folder / "layers.npz", _layers(robot.controller.lgmd, resolution, shown))
+    write_arrays(folder / "layers.npz", _layers(robot.controller.detector, resolution, shown))
 
 
 def _record(

@@ -7,8 +7,8 @@ result of that work (`jax.export`, 1 to 2 MB), in a folder of JAX's cache. Anoth
 A stored program is used again only if all of these are the same: function, static arguments, structure, shapes and
 precision of the other arguments, every byte of this package when it was imported, versions of JAX and MJX, devices, and
 JAX's settings. Attributes that are replaced in an imported module (monkeypatching) are not noticed; disable the cache
-for that. Static arguments may contain functions. A program is stored only if all of them belong to this package and
-none is a closure, since the source of others may change unnoticed.
+for that. Static arguments, and static fields of the others, may contain functions and modules. A program is stored only
+if all of them belong to this package and none is a closure, since the source of others may change unnoticed.
 
 | exported/<function>-<key>-<release>.program | content                                                        |
 | ------------------------------------------- | -------------------------------------------------------------- |
@@ -91,7 +91,8 @@ class CachedFunction(Generic[P, R]):
         types = jax.tree.map(lambda leaf: str(jax.typeof(leaf)), args)
         inside_trace = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
         try:
-            static, folder = static_arguments.describe(kwargs), None if inside_trace else _cache_folder()
+            own = list(static_arguments.static_fields(args))
+            static, folder = static_arguments.describe((own, kwargs)), None if inside_trace else _cache_folder()
         except ValueError:
             static, folder = kwargs, None
         key = _program_key(self._function, types, static)

@@ -10,6 +10,7 @@
 | named tuple                                | {"namedtuple": ["module:class", {field: ...}]}             |
 | dataclass that is registered as a pytree   | {"dataclass": ["module:class", {field: ...}]}              |
 | static member of an Enum                   | {"enum": ["module:class", member]}                         |
+| static module                              | {"module": name}                                           |
 | static NumPy array or scalar               | {"array": [dtype, shape, hex]}, {"scalar": [dtype, hex]}   |
 
 Fields of a dataclass are written whether they are static or not; registration says which are. Everything else raises
@@ -24,6 +25,7 @@ import dataclasses
 import sys
 from collections.abc import Collection, Mapping
 from enum import Enum
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -63,6 +65,8 @@ def _encode(value: object, packages: Collection[str]) -> object:
         return value
     if isinstance(value, Enum):
         return {"enum": [_class_name(type(value), packages), value.name]}
+    if isinstance(value, ModuleType):
+        return {"module": _find_module(value.__name__, packages).__name__}
     if isinstance(value, (np.ndarray, np.generic)):
         return _encode_numbers(value)
     if type(value) is tuple or type(value) is list:
@@ -89,6 +93,8 @@ def _decode(encoded: Any, packages: Collection[str]) -> object:
             return {key: _decode(item, packages) for key, item in content.items()}
         case "enum":
             return _find_enum(content[0], packages).__members__[content[1]]
+        case "module":
+            return _find_module(content, packages)
         case "array":
             return _decode_numbers(content[0], content[2]).reshape(content[1])
         case "scalar":
@@ -140,9 +146,7 @@ def _find_enum(name: str, packages: Collection[str]) -> type[Enum]:
 def _find_class(name: str, packages: Collection[str]) -> type:
     """Find a class by "module:class" without importing anything and without calling anything."""
     module, _, path = name.partition(":")
-    if module.partition(".")[0] not in packages or module not in sys.modules:
-        raise ValueError(f"expected a class of an imported module of {sorted(packages)}, got {name}")
-    found: object = sys.modules[module]
+    found: object = _find_module(module, packages)
     for part in path.split("."):
         found = vars(found).get(part)  # getattr could import, as packages with lazy imports do
         if not isinstance(found, type):
@@ -150,6 +154,13 @@ def _find_class(name: str, packages: Collection[str]) -> type:
     if not isinstance(found, type) or (found.__module__, found.__qualname__) != (module, path):
         raise ValueError(f"expected the name of a class, got {name}")
     return found
+
+
+def _find_module(name: str, packages: Collection[str]) -> ModuleType:
+    """Find an imported module by its name."""
+    if name.partition(".")[0] not in packages or name not in sys.modules:
+        raise ValueError(f"expected an imported module of {sorted(packages)}, got {name}")
+    return sys.modules[name]
 
 
 def _encode_numbers(value: np.ndarray | np.generic) -> dict[str, list[object]]:

@@ -2,6 +2,7 @@ from . import assembly as assembly
 from . import closed_loop as closed_loop
 from . import episode_tables as episode_tables
 from . import episodes as episodes
+from . import faulty_cameras as faulty_cameras
 from . import finite as finite
 from . import recording as recording
 from . import rerender as rerender

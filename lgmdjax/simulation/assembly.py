@@ -1,4 +1,4 @@
-"""Robots assembled from the files of a run, or from those of the package."""
+"""Robots assembled from parameters, from the files of a run, or from those of the package."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -6,17 +6,19 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import PyTree
 
-from lgmdjax.control import braitenberg, compass, navigator, policies
+from lgmdjax.control import braitenberg, compass, controller, navigator, policies
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
-from lgmdjax.detectors import lgmd
+from lgmdjax.detectors import lgmd, protocol
+from lgmdjax.detectors.protocol import Detector
 from lgmdjax.errors import InputError
-from lgmdjax.locomotion import shaping
+from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.paths import PRETRAINED_DIR
-from lgmdjax.runtime import checksums, schema
+from lgmdjax.runtime import checksums, schema, static_arguments
 from lgmdjax.runtime.storage import JsonObject, read_arrays, read_json
-from lgmdjax.sensors import camera, hemifield
+from lgmdjax.sensors import camera, hemifield, laser
 from lgmdjax.sensors.settings import FIELD_LIMITS, CameraSettings, Resolution
 from lgmdjax.simulation import closed_loop
 
@@ -48,7 +50,9 @@ def camera_params(settings: CameraSettings) -> camera.Params:
 def camera_settings(robot: closed_loop.Params) -> CameraSettings:
     """Return the camera settings of a robot, as `with_camera` sets them."""
     of_camera = {name: getattr(robot.camera, name) for name in ("width", "height", "overlap", "ground")}
-    return CameraSettings(**of_camera, pooling=robot.controller.lgmd.pooling, falloff=robot.controller.lgmd.falloff)
+    detector = robot.controller.detector
+    of_detector = {name: getattr(detector, name) for name in ("pooling", "falloff") if hasattr(detector, name)}
+    return CameraSettings(**of_camera, **of_detector)
 
 
 def read_camera_settings(header: JsonObject) -> CameraSettings:
@@ -58,10 +62,20 @@ def read_camera_settings(header: JsonObject) -> CameraSettings:
     return CameraSettings(**{name: eyes[name] for name in (*EYES.fields, *EYES.optional) if name in eyes})
 
 
-def fit_detector(detector: lgmd.Params, settings: CameraSettings) -> lgmd.Params:
-    """Return the LGMD with the size, the bearings and the weights of its cells set for a camera."""
-    edges = hemifield.edges(camera.Params().fov, settings.overlap)
-    return replace(detector, pooling=settings.pooling, falloff=settings.falloff, edges=edges)
+def fit_detector(detector: PyTree, settings: CameraSettings) -> PyTree:
+    """Return a detector with the size, the bearings and the weights of its cells set for a camera.
+
+    Raises InputError for cells of several pixels, or weights, that the detector does not have.
+    """
+    wanted = {"pooling": settings.pooling, "falloff": settings.falloff}
+    for name, value in wanted.items():
+        if value != getattr(CameraSettings, name) and not hasattr(detector, name):
+            raise InputError(
+                f"expected a detector with the parameter {name} for a camera with {name} {value:g}, got one of "
+                f"{type(detector).__module__}; lgmdjax.detectors.scaled gives any detector cells of several pixels"
+            )
+    wanted["edges"] = hemifield.edges(camera.Params().fov, settings.overlap)
+    return replace(detector, **{name: value for name, value in wanted.items() if hasattr(detector, name)})
 
 
 def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAINED_DIR) -> closed_loop.Params:
@@ -88,6 +102,47 @@ def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAIN
     return assemble_robot(gait_folder, read_camera_settings(header), lgmd_params(header["lgmd"]), switch)
 
 
+def assemble(
+    policy_params: PyTree,
+    *,
+    detector_model: Detector = lgmd,
+    detector_params: PyTree = None,
+    cpg_params: cpg.Params | None = None,
+    shaping_params: shaping.Params | None = None,
+    teacher_params: braitenberg.Params | None = None,
+    camera_params: camera.Params | None = None,
+    laser_params: laser.Params | None = None,
+) -> closed_loop.Params:
+    """Assemble a robot from the parameters of its policy and of all components that are not the default.
+
+    Plain numbers become arrays, so that one compiled program serves all values and can be differentiated with respect
+    to them. The default shaping networks are those of the package (`shaping.load_pretrained`); those of a detector are
+    its `Params()`.
+
+    Raises InputError for invalid numbers (`check` of the components), unless some are traced, and for a detector that
+    does not have its interface (`protocol.check`).
+    """
+    controller_params = controller.Params(
+        detector=detector_model.Params() if detector_params is None else detector_params,
+        policy=policy_params,
+        cpg=cpg_params or cpg.Params(),
+        shaping=shaping_params or shaping.load_pretrained(),
+        detector_model=detector_model,
+    )
+    params = closed_loop.Params(
+        controller=controller_params,
+        teacher=teacher_params or braitenberg.Params(),
+        camera=camera_params or camera.Params(),
+        laser=laser_params or laser.Params(),
+    )
+    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
+        protocol.check(detector_model, controller_params.detector, closed_loop.frame_type(params.camera))
+        cpg.check(controller_params.cpg)
+        braitenberg.check(params.teacher)
+        laser.check(params.laser)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if np.isscalar(leaf) else leaf, params)
+
+
 def assemble_robot(
     gait_folder: Path,
     camera_settings: CameraSettings,
@@ -95,9 +150,9 @@ def assemble_robot(
     policy_params: policies.PolicySwitch,
 ) -> closed_loop.Params:
     """Return a robot with the fitted gait of a run, and the given camera, detector and policies."""
-    params = closed_loop.assemble(
+    params = assemble(
         policy_params,
-        lgmd_params=lgmd_params,
+        detector_params=lgmd_params,
         shaping_params=shaping.load(gait_folder / "shaping.safetensors"),
         camera_params=camera_params(camera_settings),
     )
@@ -137,24 +192,44 @@ def make_policies(
 def with_camera(params: closed_loop.Params, settings: CameraSettings) -> closed_loop.Params:
     """Return the robot with another camera.
 
-    `settings.pooling` keeps the visual angle of an LGMD cell, so that its responses change little.
+    `settings.pooling` keeps the visual angle of a detector's cell, so that its responses change little.
     """
-    lgmd_params = fit_detector(params.controller.lgmd, settings)
-    return replace(params, camera=camera_params(settings), controller=replace(params.controller, lgmd=lgmd_params))
+    detector = fit_detector(params.controller.detector, settings)
+    return replace(params, camera=camera_params(settings), controller=replace(params.controller, detector=detector))
+
+
+def with_detector(robot: closed_loop.Params, model: Detector, params: PyTree = None) -> closed_loop.Params:
+    """Return the robot with another looming detector behind both cameras, whose policies are to be trained for it.
+
+    >>> from lgmdjax.detectors import emd
+    >>> with_detector(load_robot(), emd).controller.detector.gain.tolist()
+    1000.0
+
+    Args:
+        robot: the robot.
+        model: a module or a hashable object with the interface of `lgmdjax.detectors.protocol`.
+        params: its parameters; `model.Params()` if None.
+
+    Raises InputError for a detector without that interface, and for constants that it refuses.
+    """
+    given = model.Params() if params is None else params
+    protocol.check(model, given, closed_loop.frame_type(robot.camera))
+    arrays = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if np.isscalar(leaf) else leaf, given)
+    return replace(robot, controller=replace(robot.controller, detector=arrays, detector_model=model))
 
 
 def with_resolution(robot: closed_loop.Params, resolution: Resolution) -> closed_loop.Params:
-    """Return the robot with images and LGMD cells of another size; its LGMDs keep their field of view and weights."""
+    """Return the robot with images and cells of another size; its detectors keep their field of view and weights."""
     sizes = {name: getattr(resolution, name) for name in ("width", "height", "pooling")}
     return with_camera(robot, replace(camera_settings(robot), **sizes))
 
 
 def scale_resolution(robot: closed_loop.Params, width: int) -> Resolution:
-    """Return the resolution with images of another width and LGMD cells of the same size in degrees.
+    """Return the resolution with images of another width and cells of the same size in degrees.
 
     Raises InputError for a width at which the cells are not whole pixels.
     """
-    camera, pooling = robot.camera, robot.controller.lgmd.pooling
+    camera, pooling = robot.camera, camera_settings(robot).pooling
     if width < 1 or (pooling * width) % camera.width or (camera.height * width) % camera.width:
         raise InputError(
             f"expected a --width whose cells are whole pixels ({pooling} at width {camera.width}), got {width}; "
@@ -201,10 +276,18 @@ def select_policy(params: closed_loop.Params, policy: policies.Policy) -> closed
 
 
 def fingerprint(params: closed_loop.Params) -> str:
-    """Return a hash of all parameters of a robot and their structure."""
+    """Return a hash of all parameters of a robot, their structure, and its detector.
+
+    Raises InputError for a detector of your own that is not in a file (`protocol.identify`).
+    """
     leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params)]
-    structure = repr((params.camera, jax.tree.structure(params))).encode()
-    return checksums.digest(*leaves, structure)[:16]
+    structure = repr((params.camera, jax.tree.structure(params)))
+    for model in static_arguments.static_fields(params):
+        if isinstance(model, Detector):
+            structure = structure.replace(repr(model), protocol.identify(model))
+    # Not named, so that the fingerprints of walks that were recorded before there was a choice stay the same.
+    structure = structure.replace(f"({protocol.identify(lgmd)},)", "()")
+    return checksums.digest(*leaves, structure.encode())[:16]
 
 
 def load_detector(folder: Path) -> lgmd.Params:

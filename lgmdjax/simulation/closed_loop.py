@@ -2,7 +2,7 @@
 
 In each frame of 1/30 s a robot
 
-1. renders both cameras from its present pose, scans with the laser, and steps the LGMDs,
+1. renders both cameras from its present pose, scans with the laser, and steps the looming detectors,
 2. lets the policy choose a velocity, and the teacher label the frame,
 3. runs CPG, servos and physics for `SUBSTEPS` steps.
 
@@ -22,24 +22,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, compass, controller
+from lgmdjax.control.controller import Response
 from lgmdjax.control.policies import Observation, Policy
-from lgmdjax.detectors import lgmd
+from lgmdjax.errors import InputError
 from lgmdjax.html import NotebookTable
-from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.runtime.mjx import mjx
-from lgmdjax.sensors import camera, laser
+from lgmdjax.sensors import camera, camera_faults, laser
+from lgmdjax.simulation import faulty_cameras
 from lgmdjax.world import arena, floor_plan
 
 Tree = TypeVar("Tree")
 AnyArray = Array | np.ndarray
 
 GradPath = Literal["controller", "body", "everything"]
-"""What a gradient passes through: only the policy; also the body and the label; or also the camera and the LGMDs."""
+"""What a gradient passes through: only the policy; also the body and the label; or also camera and detectors."""
 
 FRAME_RATE = 30.0  # Hz, of the camera (paper sec. 3.1)
 PATH_STRIDE = 8  # frames between two points of a path that a notebook shows
@@ -65,7 +65,8 @@ class Room(NotebookTable):
 
     arena: arena.Arena
     starts: Float[Array, "starts 3"]
-    key: Array  # random key of the policy
+    key: Array  # random key of policy and cameras
+    faults: camera_faults.Params | None = None  # of the robot's cameras (`faulty_cameras`), none if None
 
     def _picture(self) -> str:
         return self.arena._picture()
@@ -79,12 +80,13 @@ class State:
     controller: controller.State
     teacher: braitenberg.State
     heading: compass.State | None  # None without `Params.heading`
-    response: lgmd.Response  # of both LGMDs to the last picture
+    response: Response  # of both detectors to the last picture
     frame: Int[Array, ""]  # frames since the start of the rollout
     resets: Int[Array, ""]  # number of resets so far
     is_first: Bool[Array, ""]  # first frame after a start or reset: there is no picture to compare with
     contact: Bool[Array, ""]  # touched something in the last frame
     ok: Bool[Array, ""]  # finite and not fallen
+    cameras: faulty_cameras.State | None = None  # if the room has faults
 
 
 @struct.dataclass(kw_only=True)
@@ -98,8 +100,8 @@ class Record(NotebookTable):
     position: Float[AnyArray, "*axes 3"]  # m, of the trunk
     quaternion: Float[AnyArray, "*axes 4"]  # w x y z
     joints: Float[AnyArray, "*axes 6 3"]  # rad
-    u: Float[AnyArray, "*axes 2"]  # 1, outputs of the LGMDs, left first
-    feed_forward: Float[AnyArray, "*axes 2"]  # grey
+    u: Float[AnyArray, "*axes 2"]  # 1, outputs of the detectors, left first
+    feed_forward: Float[AnyArray, "*axes 2"]  # grey; zero for a detector without
     excitation: Float[AnyArray, "*axes 2"]  # grey, U / n_cell
     distances: Float[AnyArray, "*axes 2"]  # m, to the nearest obstacle
     corridor: Float[AnyArray, "*axes 2"]  # m, to the nearest obstacle in the way
@@ -124,59 +126,28 @@ class Record(NotebookTable):
         return floor_plan.svg(None, paths, marks)
 
 
-def assemble(
-    policy_params: PyTree,
-    *,
-    lgmd_params: lgmd.Params | None = None,
-    cpg_params: cpg.Params | None = None,
-    shaping_params: shaping.Params | None = None,
-    teacher_params: braitenberg.Params | None = None,
-    camera_params: camera.Params | None = None,
-    laser_params: laser.Params | None = None,
-) -> Params:
-    """Assemble a robot from the parameters of its policy and of all components that are not the default.
-
-    Plain numbers become arrays, so that one compiled program serves all values and can be differentiated with respect
-    to them. The default shaping networks are those of the package (`shaping.load_pretrained`).
-
-    Raises InputError for invalid numbers (`check` of the components), unless some are traced.
-    """
-    controller_params = controller.Params(
-        lgmd=lgmd_params or lgmd.Params(),
-        policy=policy_params,
-        cpg=cpg_params or cpg.Params(),
-        shaping=shaping_params or shaping.load_pretrained(),
-    )
-    params = Params(
-        controller=controller_params,
-        teacher=teacher_params or braitenberg.Params(),
-        camera=camera_params or camera.Params(),
-        laser=laser_params or laser.Params(),
-    )
-    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(params)):
-        lgmd.check(controller_params.lgmd)
-        cpg.check(controller_params.cpg)
-        braitenberg.check(params.teacher)
-        laser.check(params.laser)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if np.isscalar(leaf) else leaf, params)
+def frame_type(camera_params: camera.Params) -> jax.ShapeDtypeStruct:
+    """Return shape and type of what the camera shows to each detector."""
+    return jax.ShapeDtypeStruct(camera.image_shape(camera_params)[1:], jnp.result_type(float))
 
 
 def init(params: Params, model: mjx.Model, room: Room, policy: Policy) -> State:
     """Return the state of a robot at the room's first start, its CPG on the limit cycle, before the first picture."""
-    black = jnp.zeros(camera.image_shape(params.camera))
+    black, faults = jnp.zeros(camera.image_shape(params.camera)), room.faults
+    if faults is not None and params.frame_stride is not None:
+        raise InputError("expected a robot that sees in every frame in rooms with camera faults, got a frame_stride")
     return State(
         data=hexapod.init(model, room.starts[0]),
         controller=controller.init(params.controller, black, policy, room.key),
         teacher=braitenberg.init(params.teacher),
         heading=_init_heading(params, room, jnp.asarray(0, jnp.int32)),
-        response=lgmd.Response(
-            u=jnp.full(2, lgmd.U_AT_REST, float), feed_forward=jnp.zeros(2), excitation=jnp.zeros(2)
-        ),
+        response=controller.rest(),
         frame=jnp.asarray(0, jnp.int32),
         resets=jnp.asarray(0, jnp.int32),
         is_first=jnp.asarray(True),
         contact=jnp.asarray(False),
         ok=jnp.asarray(True),
+        cameras=None if faults is None else faulty_cameras.init(faults, black, jax.random.fold_in(room.key, -1)),
     )
 
 
@@ -194,12 +165,12 @@ def step(
 
     Without `render` the pictures are black (u = 0.5), for policies that do not use the camera.
 
-    Gradient: through all that `grad_path` names. With "body" the pictures and the LGMDs' responses are held constant;
-    with "controller" also the label, the distances and the body.
+    Gradient: through all that `grad_path` names. With "body" the pictures and the detectors' responses are held
+    constant; with "controller" also the label, the distances and the body.
     """
     state = reset(params, room, state, policy)
     scene = arena.at_time(room.arena, state.frame / FRAME_RATE)
-    state, observation = observe(params, scene, state, render)
+    state, observation = observe(params, scene, state, render, room.faults)
     if grad_path != "everything":
         state, observation = _hold_vision(state, observation)
     state, label = decide(params, state, observation, policy)
@@ -213,9 +184,9 @@ def step(
 
 
 def _hold_vision(state: State, observation: Observation) -> tuple[State, Observation]:
-    """Stop the gradient through pictures and responses of the LGMDs."""
-    lgmd_state, response = jax.lax.stop_gradient((state.controller.lgmd, state.response))
-    held = replace(state, controller=replace(state.controller, lgmd=lgmd_state), response=response)
+    """Stop the gradient through pictures and responses of the detectors."""
+    detector_state, response = jax.lax.stop_gradient((state.controller.detector, state.response))
+    held = replace(state, controller=replace(state.controller, detector=detector_state), response=response)
     outputs = {name: jax.lax.stop_gradient(getattr(observation, name)) for name in ("u", "feed_forward", "excitation")}
     return held, replace(observation, **outputs)
 
@@ -238,10 +209,19 @@ def reset(params: Params, room: Room, state: State, policy: Policy) -> State:
 
 
 def observe(
-    params: Params, scene: arena.Arena, state: State, render: Bool[Array, ""] | bool = True
+    params: Params,
+    scene: arena.Arena,
+    state: State,
+    render: Bool[Array, ""] | bool = True,
+    faults: camera_faults.Params | None = None,
 ) -> tuple[State, Observation]:
-    """Render, scan, and step the LGMDs (eqs. 7-16); return the observation from the robot's present pose."""
-    return respond(params, state, *sense(params, scene, state, render))
+    """Render, scan, and step the detectors (eqs. 7-16); return the observation from the robot's present pose."""
+    frames, ranges = sense(params, scene, state, render)
+    if faults is None or state.cameras is None:
+        return respond(params, state, frames, ranges)
+    cameras, frames = faulty_cameras.step(faults, state.cameras, frames, state.is_first)
+    response = _where(cameras.is_waiting, controller.rest(frames.dtype), state.response)
+    return respond(params, replace(state, cameras=cameras, response=response), frames, ranges)
 
 
 def sense(
@@ -257,11 +237,11 @@ def sense(
 def respond(
     params: Params, state: State, frames: Float[Array, "2 height columns"], ranges: Float[Array, " rays"]
 ) -> tuple[State, Observation]:
-    """Step the LGMDs (eqs. 7-16) with what `sense` returned; return the observation."""
-    detected = controller.detect_or_start(params.controller, state.controller, frames, state.is_first)
-    controller_state, response = detected
-    if params.frame_stride is not None:
-        has_picture = state.is_first | (state.frame % params.frame_stride == 0)
+    """Step the detectors (eqs. 7-16) with what `sense` returned; return the observation."""
+    is_first = state.is_first if state.cameras is None else state.cameras.is_waiting
+    controller_state, response = controller.detect_or_start(params.controller, state.controller, frames, is_first)
+    has_picture = _has_picture(params, state)
+    if has_picture is not None:
         new, old = (controller_state, response), (state.controller, state.response)
         controller_state, response = _where(has_picture, new, old)
     observation = Observation(
@@ -272,6 +252,13 @@ def respond(
         corridor=laser.corridor_distances(params.laser, ranges),
     )
     return replace(state, controller=controller_state, response=response), observation
+
+
+def _has_picture(params: Params, state: State) -> Bool[Array, ""] | None:
+    """Return whether the detectors get a picture in this frame; None if they do in every frame."""
+    if state.cameras is not None:
+        return state.cameras.arrived
+    return None if params.frame_stride is None else state.is_first | (state.frame % params.frame_stride == 0)
 
 
 def render_stereo(

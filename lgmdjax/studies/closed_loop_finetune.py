@@ -67,7 +67,7 @@ from lgmdjax.simulation.closed_loop import FRAME_RATE, GradPath, Params, Record,
 from lgmdjax.studies.settings import FinetuneSettings
 
 FIRST_EPISODE = 2**21  # number of the first episode of finetuning, whose rooms are used nowhere else
-JOINT_PARTS = ("policy", "shaping", "lgmd.threshold", "lgmd.suppression", "lgmd.inhibition")
+JOINT_PARTS = ("policy", "shaping", "detector.threshold", "detector.suppression", "detector.inhibition")
 BINS = 12  # of a plotted curve
 
 
@@ -188,15 +188,15 @@ def _rooms(seed: int, robots: int, number: int) -> Room:
 
 def with_finetuned_params(robot: Params, finetuned: controller.Params) -> Params:
     """Return a robot with all five policies and the finetuned parameters; its thresholds stay hard or smooth."""
-    constants = {name: getattr(finetuned.lgmd, name) for name in (*lgmd.SCALARS, "kernel")}
-    detector = replace(robot.controller.lgmd, **constants)
-    own = replace(robot.controller, lgmd=detector, cpg=finetuned.cpg, shaping=finetuned.shaping)
+    constants = {name: getattr(finetuned.detector, name) for name in (*lgmd.SCALARS, "kernel")}
+    detector = replace(robot.controller.detector, **constants)
+    own = replace(robot.controller, detector=detector, cpg=finetuned.cpg, shaping=finetuned.shaping)
     return assembly.with_policy(replace(robot, controller=own), "learned", finetuned.policy)
 
 
 def detector_constants(learner: Params) -> dict[str, float]:
     """Return the detector's constants that a joint fit trains."""
-    return {name: float(getattr(learner.controller.lgmd, name)) for name in lgmd.SCALARS}
+    return {name: float(getattr(learner.controller.detector, name)) for name in lgmd.SCALARS}
 
 
 def summarise(record: Record) -> JsonObject:

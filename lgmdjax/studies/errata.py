@@ -80,7 +80,7 @@ def _with_cpg(robot: closed_loop.Params, **changes: bool | Array) -> closed_loop
 
 
 def _with_lgmd(robot: closed_loop.Params, **changes: bool) -> closed_loop.Params:
-    return replace(robot, controller=replace(robot.controller, lgmd=replace(robot.controller.lgmd, **changes)))
+    return replace(robot, controller=replace(robot.controller, detector=replace(robot.controller.detector, **changes)))
 
 
 def _with_printed_shaping(robot: closed_loop.Params, folder: Path) -> closed_loop.Params:

@@ -92,7 +92,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: LgmdGradientSettings
     rendered = rerender_segments(robot, sample_segments(recorded, settings, seed), teacher_camera)
     rows = []
     for repeat in range(settings.seeds):
-        rows += fit_methods(folder, robot.controller.lgmd, rendered, settings, repeat=repeat, seed=seed + repeat)
+        rows += fit_methods(folder, robot.controller.detector, rendered, settings, repeat=repeat, seed=seed + repeat)
     storage.write_json(folder / "lgmd_gradient.json", rows)
 
 
@@ -131,7 +131,7 @@ def rerender_segments(
     Raises InputError if the responses differ from the recorded ones.
     """
     walks, differences = list[Walk](), []
-    detector = robot.controller.lgmd
+    detector = robot.controller.detector
     same = teacher_camera == assembly.camera_settings(robot)
     for robots, segments in tqdm(sampled, desc="rendering", unit="episode"):
         episode, numbers = segments[0].episode, np.array([walk.room % robots for walk in segments])

@@ -51,7 +51,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: OverlapSettings, see
     rows = []
     for overlap in settings.overlaps:
         changed = assembly.with_camera(robot, replace(camera_settings, overlap=overlap))
-        scores = [proximity_correlation(changed.controller.lgmd, changed.camera, *walks) for walks in recorded]
+        scores = [proximity_correlation(changed.controller.detector, changed.camera, *walks) for walks in recorded]
         tube = side_accuracy(folder / f"tube-{overlap:g}", changed, settings.seeds, seed)
         rows.append({"overlap": overlap, "episodes": scores, "tube": tube})
     storage.write_json(folder / "overlap.json", rows)

@@ -125,7 +125,7 @@ def _score_learners(
 def baseline(robot: closed_loop.Params) -> dict[str, float]:
     """Return the value that each parameter has in the unchanged robot."""
     eyes = assembly.camera_settings(robot)
-    threshold = round(float(robot.controller.lgmd.threshold), 6)  # undo the rounding to float32
+    threshold = round(float(robot.controller.detector.threshold), 6)  # undo the rounding to float32
     own = {
         "T_s": threshold,
         "overlap": eyes.overlap,
@@ -140,10 +140,10 @@ def baseline(robot: closed_loop.Params) -> dict[str, float]:
 
 def variations(robot: closed_loop.Params) -> Iterator[Variation]:
     """Yield the variations of all parameters that need no training."""
-    detector, eyes = robot.controller.lgmd, assembly.camera_settings(robot)
+    detector, eyes = robot.controller.detector, assembly.camera_settings(robot)
 
     def with_lgmd(**constants: Array | float) -> closed_loop.Params:
-        return replace(robot, controller=replace(robot.controller, lgmd=replace(detector, **constants)))
+        return replace(robot, controller=replace(robot.controller, detector=replace(detector, **constants)))
 
     for threshold in sorted({*THRESHOLDS, baseline(robot)["T_s"]}):
         yield Variation("T_s", threshold, with_lgmd(threshold=jnp.asarray(threshold, float)))

@@ -78,7 +78,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: VelocitySettings, se
             label=f"v = {velocity:g}", render=True,
         )  # fmt: skip
         ahead = distance_ahead(room_batches.benchmark_rooms(benchmark, seed).arena, record)
-        measured.append(score_velocity(velocity, record, ahead, float(robot.controller.lgmd.suppression)))
+        measured.append(score_velocity(velocity, record, ahead, float(robot.controller.detector.suppression)))
     storage.write_json(folder / "velocity.json", [asdict(row) for row in mark_best(measured)])
 
 

@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from lgmdjax.body import hexapod, servo_faults
 from lgmdjax.control import braitenberg, controller, policies
+from lgmdjax.control.controller import Response
 from lgmdjax.control.policies import Observation
-from lgmdjax.detectors import lgmd
 from lgmdjax.minmax import clip
 from lgmdjax.sensors import camera, camera_faults, hemifield, laser
 from lgmdjax.simulation import closed_loop
@@ -35,7 +35,7 @@ class State:
 
     controller: controller.State
     teacher: braitenberg.State
-    response: lgmd.Response
+    response: Response
     distances: Float[Array, "2"]  # m, the scanner's last measurement
     corridor: Float[Array, "2"]
     label: Float[Array, "2"]  # the teacher's velocity
@@ -52,7 +52,7 @@ def init(params: closed_loop.Params, faults: Faults, key: Array) -> State:
     return State(
         controller=controller.init(params.controller, black, POLICY, key),
         teacher=braitenberg.init(params.teacher),
-        response=lgmd.Response(u=zero + lgmd.U_AT_REST, feed_forward=zero, excitation=zero),
+        response=controller.rest(jnp.float32),
         distances=zero,
         corridor=zero,
         label=zero,

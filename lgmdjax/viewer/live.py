@@ -60,7 +60,7 @@ class LiveSimulation:
 
     def entered(self) -> Entered:
         """Return the room, and the constants of the robot's detectors."""
-        detector = self.robot.controller.lgmd
+        detector = self.robot.controller.detector
         constants = Constants(*(float(getattr(detector, name)) for name in Constants._fields))
         return Entered(room_shape.shape_of(self.room.arena), self._centres(), constants)
 

@@ -72,7 +72,10 @@ STEERED = Policy("steered", lambda params, key: SWITCH.init(params.switch, key),
 
 
 def steer(robot: closed_loop.Params, controls: Controls) -> closed_loop.Params:
-    """Return the robot with the values of the controls; its own values for controls that are None."""
+    """Return the robot with the values of the controls; its own values for controls that are None.
+
+    Raises InputError for a robot with another detector than the LGMD, whose constants and layers are shown.
+    """
     constants = {name: getattr(controls, name) for name in ("threshold", "suppression", "inhibition")}
     given = {name: jnp.asarray(value, float) for name, value in constants.items() if value is not None}
     active = jnp.asarray(policies.POLICIES.index(policies.get_policy(controls.policy)))
@@ -81,8 +84,8 @@ def steer(robot: closed_loop.Params, controls: Controls) -> closed_loop.Params:
         turn_gain=jnp.asarray(controls.turn_gain, float),
         speed=jnp.asarray(controls.speed, float),
     )
-    detector = replace(robot.controller.lgmd, **given)
-    return replace(robot, controller=replace(robot.controller, lgmd=detector, policy=steered))
+    detector = replace(controller.require_lgmd(robot.controller, "the live simulation"), **given)
+    return replace(robot, controller=replace(robot.controller, detector=detector, policy=steered))
 
 
 @cached_jit
@@ -96,11 +99,11 @@ def frame(
     params: closed_loop.Params, model: mjx.Model, room: closed_loop.Room, state: closed_loop.State
 ) -> tuple[closed_loop.State, closed_loop.Record, SensedFrame]:
     """Return the next state, its record, and what the robot sensed."""
-    before = state.controller.lgmd.difference
+    before = state.controller.detector.difference
     after, record = closed_loop.step(params, model, room, state, STEERED)
     scene = arena.at_time(room.arena, record.time)
     pictures = _render_whole(params, scene, record.position, record.quaternion)
-    layers = _layers(params.controller.lgmd, before, after.controller.lgmd, record.is_first)
+    layers = _layers(params.controller.detector, before, after.controller.detector, record.is_first)
     return after, record, SensedFrame(pictures=_to_bytes(pictures), layers=layers)
 
 
@@ -120,12 +123,12 @@ def replay(
     def step(state: lgmd.State, at: Poses) -> tuple[lgmd.State, SensedFrame]:
         pictures = _render_whole(params, with_centres(room, at.centres), at.position, at.quaternion)
         frames = _crop(params.camera, pictures)
-        first = controller.init_lgmd(params.controller, frames)
+        first = controller.init_detectors(params.controller, frames)
         before = jax.tree.map(lambda new, old: jnp.where(at.is_first, new, old), first, state)
         after, _ = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(
-            params.controller.lgmd, before, hemifield.outermost_first(frames)
+            params.controller.detector, before, hemifield.outermost_first(frames)
         )
-        layers = _layers(params.controller.lgmd, before.difference, after, at.is_first)
+        layers = _layers(params.controller.detector, before.difference, after, at.is_first)
         return after, SensedFrame(pictures=_to_bytes(pictures), layers=layers)
 
     return jax.lax.scan(step, state, poses)
@@ -133,7 +136,7 @@ def replay(
 
 def start_replay(params: closed_loop.Params) -> lgmd.State:
     """Return states of both LGMDs before any picture."""
-    return controller.init_lgmd(params.controller, jnp.zeros(camera.image_shape(params.camera)))
+    return controller.init_detectors(params.controller, jnp.zeros(camera.image_shape(params.camera)))
 
 
 @cached_jit

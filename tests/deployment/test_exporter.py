@@ -11,6 +11,7 @@ import pytest
 
 from lgmdjax.control import navigator
 from lgmdjax.deployment import c_source, exporter, nervous_system, onnx_graph, stablehlo
+from lgmdjax.detectors import emd
 from lgmdjax.errors import InputError
 from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.runtime import storage
@@ -99,7 +100,7 @@ def test_only_what_the_c_program_can_do_is_written(float32):
     robot = assembly.load_robot()
     params = nervous_system.from_robot(robot)
     controller = params.controller
-    smooth = replace(params, controller=replace(controller, lgmd=replace(controller.lgmd, smooth=True)))
+    smooth = replace(params, controller=replace(controller, detector=replace(controller.detector, smooth=True)))
     with pytest.raises(InputError, match="expected an LGMD with hard thresholds"):
         c_source.generate(smooth, "a robot")
     other = navigator.create(jax.random.key(0), "feed-forward")
@@ -107,6 +108,10 @@ def test_only_what_the_c_program_can_do_is_written(float32):
         c_source.generate(replace(params, controller=replace(controller, policy=other)), "a robot")
     with pytest.raises(InputError, match="expected a robot that sees in every frame"):
         nervous_system.from_robot(replace(robot, frame_stride=jax.numpy.asarray(2)))
+    with pytest.raises(
+        InputError, match=r"expected a robot with the detector lgmd for the export .*, got one with emd"
+    ):
+        nervous_system.from_robot(assembly.with_detector(robot, emd))
 
 
 def test_numbers_in_c_are_those_of_single_precision(float32):

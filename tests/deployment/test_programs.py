@@ -110,7 +110,7 @@ def test_the_pictures_exercise_both_detectors_and_no_cell_is_so_near_its_thresho
     u = expected[0]["u"]
     assert np.all(np.ptp(u[1:], axis=0) > 0.1) and np.any(u[2:] == lgmd.U_AT_REST) and np.mean(u > 0.51) > 0.5
     assert np.all(np.ptp(expected[0]["velocity"], axis=0) > 0.5)
-    detector = params.controller.lgmd
+    detector = params.controller.detector
     eyes = pictures[:, 0, :30, :40], pictures[:, 1, :30, :39:-1]
     cells = np.stack([[lgmd_cells(detector, eye)] for eye in eyes])
     P = np.diff(cells.reshape(2, FRAMES, *cells.shape[-2:]).astype(float), axis=1)
@@ -132,7 +132,7 @@ def correlate(difference: np.ndarray) -> np.ndarray:
 
 def test_jax_equals_the_papers_equations(params, pictures, expected):
     """A second of it in double precision, from the transcriptions of LGMD, LSTM and Matsuoka's network."""
-    frames, detector, policy = 30, params.controller.lgmd, params.controller.policy
+    frames, detector, policy = 30, params.controller.detector, params.controller.policy
     halves = pictures[:frames, 0, :30, :40], pictures[:frames, 1, :30, :39:-1]  # above the horizon, outermost first
     cells = [lgmd_cells(detector, half).astype(float) for half in halves]
     thresholds = float(detector.threshold), float(detector.suppression), float(detector.inhibition)

@@ -19,7 +19,7 @@ from lgmdjax.detectors import lgmd
 from lgmdjax.environments import functional, gym_env, rewards
 from lgmdjax.errors import InputError
 from lgmdjax.sensors import camera
-from lgmdjax.simulation import closed_loop, rollout, room_batches
+from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches
 from lgmdjax.world import arena
 
 ID = "lgmdjax/Hexapod-v0"
@@ -32,9 +32,9 @@ assert lgmdjax.environments.functional is functional  # its import registers the
 def robot():
     """Small eyes, and policy direct, which turns by what they see."""
     direct = policies.DirectParams(rule=braitenberg.Params(), gain=jnp.asarray(20.0))
-    return closed_loop.assemble(
+    return assembly.assemble(
         direct,
-        lgmd_params=lgmd.Params(threshold=0.5, suppression=30.0),
+        detector_params=lgmd.Params(threshold=0.5, suppression=30.0),
         camera_params=camera.Params(width=32, height=24),
     )
 

@@ -17,7 +17,7 @@ from lgmdjax.cli import flags, main
 from lgmdjax.cli import trial as cli_trial
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import run_trial
-from lgmdjax.simulation import assembly, closed_loop, episodes, recording, room_batches
+from lgmdjax.simulation import assembly, episodes, recording, room_batches
 
 ROOT = Path(__file__).parents[2]
 SEEDS = 2
@@ -110,7 +110,7 @@ def test_any_number_of_robots_is_rolled_out_in_batches_of_one_size(monkeypatch):
     monkeypatch.setattr(recording, "rollout_with_progress", stand)
     monkeypatch.setattr(recording, "BATCH_SIZES", (2, 4))
     rooms = room_batches.random_rooms(jax.random.key(0), 9)
-    robot = closed_loop.assemble(assembly.make_policies())
+    robot = assembly.assemble(assembly.make_policies())
     batches = list(recording.rollout_in_batches(robot, hexapod.build(), rooms, 0.1, "standing", skip_batches=1))
     assert sizes == [4, 4]
     assert [numbers for numbers, _ in batches] == [[4, 5, 6, 7], [8]]

@@ -11,7 +11,7 @@ from lgmdjax.control import navigator
 from lgmdjax.learning import behaviour_cloning, dagger
 from lgmdjax.learning.settings import TrainSettings
 from lgmdjax.sensors.settings import CameraSettings
-from lgmdjax.simulation import assembly, closed_loop, episodes, recording
+from lgmdjax.simulation import assembly, episodes, recording
 
 SETTINGS = TrainSettings(
     eyes=CameraSettings(width=16, height=12), epochs=1, dagger_rounds=2, round_epochs=1, robots=4, round_seconds=0.1
@@ -40,7 +40,7 @@ def run_dagger(monkeypatch):
     def run(folder, recorded, at_batch=0):
         seen.clear()
         interrupt_at[0] = at_batch
-        robot = closed_loop.assemble(assembly.make_policies())
+        robot = assembly.assemble(assembly.make_policies())
         return dagger.run(folder, robot, recorded, SETTINGS, seed=0), list(seen)
 
     monkeypatch.setattr(recording, "BATCH_SIZES", (2,))
@@ -110,7 +110,7 @@ def test_the_smallest_turn_gain_with_nearly_the_fewest_approaches_is_selected(re
     monkeypatch.setattr(
         behaviour_cloning, "rescale_turns", lambda params, walks, turn_gain=1.5: replace(params, output_scale=turn_gain)
     )
-    robot, params = closed_loop.assemble(assembly.make_policies()), navigator.create(jax.random.key(0))
+    robot, params = assembly.assemble(assembly.make_policies()), navigator.create(jax.random.key(0))
     fit = behaviour_cloning.FitResult(params=params, best=params, train_mse=np.zeros(1), test_mse=np.zeros(1))
     several = replace(SETTINGS, turn_gains=tuple(approaches))
     chosen, rows = dagger.select_turn_gain(tmp_path, robot, fit, recorded, several, seed=0)

@@ -39,9 +39,9 @@ def params():
 
     To compile faster, its CPG takes one Runge-Kutta step, and its cameras have few obstacles in a tile.
     """
-    return closed_loop.assemble(
+    return assembly.assemble(
         navigator.create(jax.random.key(3)),
-        lgmd_params=lgmd.Params(threshold=0.5, suppression=30.0, suppression_width=10.0, smooth=True),
+        detector_params=lgmd.Params(threshold=0.5, suppression=30.0, suppression_width=10.0, smooth=True),
         cpg_params=cpg.Params(substeps=1),
         camera_params=camera.Params(width=48, height=36, overlap=0.6, tile_capacity=2, bands=2),
     )
@@ -120,7 +120,7 @@ def test_the_gradient_through_the_controller_is_that_of_imitation_on_the_recorde
     expected = jax.grad(imitation_loss)(params.controller.policy)
     assert all(np.any(leaf != 0) for leaf in jax.tree.leaves(expected.weights))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-12), gradient.policy, expected)
-    others = (gradient.lgmd, gradient.cpg, gradient.shaping)
+    others = (gradient.detector, gradient.cpg, gradient.shaping)
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(others))
 
 
@@ -158,7 +158,7 @@ def test_the_gradient_through_the_body_is_complete_without_rendering(params, bat
     found, _, _ = batch_gradient([rolled_out[1]] * 4)
     grad = found.grad  # all norms are equal, so none is clipped
     tangent, step = random_direction(params.controller), 1e-6
-    tangent = replace(tangent, lgmd=jax.tree.map(jnp.zeros_like, tangent.lgmd))
+    tangent = replace(tangent, detector=jax.tree.map(jnp.zeros_like, tangent.detector))
     ends = [
         batch_gradient([rolled_out[1]] * 4, jax.tree.map(lambda x, dx, by=by: x + by * dx, params.controller, tangent))[
             0
@@ -166,7 +166,7 @@ def test_the_gradient_through_the_body_is_complete_without_rendering(params, bat
         for by in (step, -step)
     ]
     np.testing.assert_allclose(inner_product(grad, tangent), (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
-    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(grad.lgmd))
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(grad.detector))
     assert all(np.any(leaf != 0) for leaf in jax.tree.leaves((grad.shaping, grad.cpg.cycle_time)))
 
 
@@ -224,7 +224,7 @@ def test_fine_tuning_changes_trainable_parameters_and_reports_every_window(param
     assert all(row.nonfinite == row.fallen == row.contacts == 0 < row.median_norm <= row.max_norm for row in rows)
     assert program._cache_size() == max(before, 1)
     before, after = params.controller, tuned.controller
-    jax.tree.map(np.testing.assert_array_equal, (before.lgmd, before.shaping), (after.lgmd, after.shaping))
+    jax.tree.map(np.testing.assert_array_equal, (before.detector, before.shaping), (after.detector, after.shaping))
     for name in ("input_mean", "input_scale", "output_mean", "output_scale"):
         np.testing.assert_array_equal(getattr(before.policy, name), getattr(after.policy, name))
     changed = np.abs(after.cpg.cycle_time / before.cpg.cycle_time - 1)
@@ -246,7 +246,7 @@ def test_interrupted_fine_tuning_resumes_after_its_last_room(finetune, tmp_path)
 
 def test_a_robot_with_its_navigator_only_and_smooth_thresholds():
     robot = rollout_gradient.smooth_thresholds(rollout_gradient.learned_only(assembly.load_robot()))
-    detector = robot.controller.lgmd
+    detector = robot.controller.detector
     assert detector.smooth and isinstance(robot.controller.policy, navigator.Params)
     np.testing.assert_allclose(detector.suppression_width, 0.3 * detector.suppression)
     assert all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(robot.controller))

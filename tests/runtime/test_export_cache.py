@@ -103,12 +103,28 @@ def test_a_static_function_is_kept_only_if_the_package_has_it(cache):
     assert len(list(cache.iterdir())) == 1
 
 
+def test_a_program_of_a_detector_is_kept_only_if_the_package_has_it(cache):
+    """A static field of an argument: a module of the package, or one of the user, whose source may change unnoticed."""
+    traces = []
+
+    def gather(tagged):
+        traces.append(tagged.label)
+        return replace(tagged, number=2 * tagged.number)
+
+    for label, kept in ((minmax, 1), (pytest, 1), (sharding, 2)):
+        for _ in range(2):
+            found = export_cache.cached_jit(gather)(Tagged(jnp.ones(()), label))
+            assert found.label is label and found.number == 2.0
+        assert len(list(cache.iterdir())) == kept
+    assert traces == [minmax, pytest, pytest, sharding]
+
+
 @struct.dataclass
 class Tagged:
     """A number with a static label."""
 
     number: jax.Array
-    label: str = struct.field(pytree_node=False)
+    label: object = struct.field(pytree_node=False)
 
 
 class Pair(NamedTuple):

@@ -56,6 +56,7 @@ TREES = [
     {"key": KEY, "keys": jax.random.split(KEY)},
     Tagged(1.0),  # pyright: ignore[reportArgumentType]
     [Tagged(jnp.ones(2), label="b", sizes=(), ratio=float("inf"), side=Side.LEFT, count=np.int64(2**40))],
+    Tagged(1.0, label=optax),  # pyright: ignore[reportArgumentType]
     optax.adam(1e-3).init({"w": jnp.ones(2)}),
 ]
 
@@ -81,6 +82,7 @@ def test_the_state_of_the_physics_survives_json():
         Tagged(1.0, label=b"bytes"),  # pyright: ignore[reportArgumentType]
         Tagged(1.0, label=print),  # pyright: ignore[reportArgumentType]
         Tagged(1.0, label=np.array(["text"])),  # pyright: ignore[reportArgumentType]
+        Tagged(1.0, label=json),  # pyright: ignore[reportArgumentType]
         Tagged(1.0, label=Unregistered()),  # pyright: ignore[reportArgumentType]
         jax.tree_util.Partial(print, 1.0),
     ],
@@ -111,6 +113,8 @@ def test_a_local_class_is_refused():
         {"namedtuple": [f"{__name__}:Pair", {"first": 1}]},
         {"enum": [f"{__name__}:Tagged", "label"]},
         {"enum": [f"{__name__}:Side", "__class__"]},
+        {"module": "subprocess"},
+        {"module": ["optax"]},
         {"array": ["O", [1], "0000000000000000"]},
         {"array": ["<i8", [2], "00"]},
         {"call": ["print", []]},

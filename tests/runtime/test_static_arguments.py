@@ -3,10 +3,12 @@
 import functools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import pytest
 
 from lgmdjax.control import policies
+from lgmdjax.detectors import emd
 from lgmdjax.runtime import static_arguments
 
 EVERY_POLICY = (*policies.POLICIES, policies.SWITCH)
@@ -36,3 +38,21 @@ def test_what_may_change_unnoticed_is_refused(function: Callable[..., object]) -
     """A closure, whoever wrote it, and what is not of this package."""
     with pytest.raises(ValueError, match="expected a function of lgmdjax that is no closure"):
         static_arguments.describe({"frames": 3, "policy": (policies.BLIND, function)})
+
+
+@dataclass
+class Field:
+    number: float
+    function: object = field(metadata={"pytree_node": False}, default=None)
+
+
+def test_static_fields_are_found_at_any_depth() -> None:
+    tree = {"a": [Field(1.0, "x"), (Field(2.0, emd), None)]}
+    assert list(static_arguments.static_fields(tree)) == ["x", emd]
+
+
+@pytest.mark.parametrize("foreign", [pytest, Field(1.0, math.sin), object.__new__(type("Own", (), {}))])
+def test_a_module_or_object_of_another_package_is_refused(foreign: object) -> None:
+    assert static_arguments.describe([emd]) == [("module", "lgmdjax.detectors.emd")]
+    with pytest.raises(ValueError, match="expected"):
+        static_arguments.describe({"model": foreign})

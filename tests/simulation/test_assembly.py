@@ -1,8 +1,11 @@
 """Robots from files: their policies, camera and fingerprint."""
 
+import importlib
 import json
 import shutil
+import sys
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +16,10 @@ from safetensors.numpy import load_file, save_file
 
 from lgmdjax.control import navigator, policies
 from lgmdjax.control.names import POLICY_NAMES
+from lgmdjax.detectors import dsn, emd, eta, grm, lgmd, scaled
 from lgmdjax.errors import InputError
 from lgmdjax.paths import PRETRAINED_DIR
-from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.sensors.settings import CameraSettings, Resolution
 from lgmdjax.simulation import assembly
 
 
@@ -41,8 +45,8 @@ def test_select_policy_activates_it(robot):
 def test_with_camera_changes_camera_and_pooling(robot):
     other = assembly.with_camera(robot, CameraSettings(width=80, height=60, overlap=0.7, pooling=3))
     assert (other.camera.width, other.camera.height, other.camera.overlap) == (80, 60, 0.7)
-    assert other.controller.lgmd.pooling == 3
-    assert other.controller.lgmd.threshold == robot.controller.lgmd.threshold
+    assert other.controller.detector.pooling == 3
+    assert other.controller.detector.threshold == robot.controller.detector.threshold
 
 
 def test_a_robot_keeps_its_field_at_every_resolution(robot):
@@ -52,7 +56,7 @@ def test_a_robot_keeps_its_field_at_every_resolution(robot):
     assert assembly.camera_settings(finer) == CameraSettings(
         width=160, height=120, pooling=6, overlap=0.7, ground=0.25, falloff=1.5
     )
-    assert finer.controller.lgmd.edges == trained.controller.lgmd.edges
+    assert finer.controller.detector.edges == trained.controller.detector.edges
     scaled = assembly.with_resolution(robot, assembly.scale_resolution(robot, 160))
     assert assembly.camera_settings(scaled).falloff == assembly.camera_settings(robot).falloff
 
@@ -76,6 +80,57 @@ def test_fingerprint_depends_on_every_number_and_on_the_camera(robot):
         replace(robot, head_sway=jnp.asarray(1.0)),
     )
     assert len({assembly.fingerprint(one) for one in (robot, *others)}) == 5
+
+
+def test_another_detector_is_part_of_the_robot(robot):
+    models: tuple[Any, ...] = (emd, dsn)
+    for model in models:
+        other = assembly.with_detector(robot, model)
+        assert other.controller.detector_model is model
+        assert jax.tree.structure(other.controller.detector) == jax.tree.structure(model.Params())
+        assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(other.controller.detector))
+    with pytest.raises(InputError, match="detector eta: expected init and step for a frame"):
+        assembly.with_detector(robot, eta)
+    with pytest.raises(InputError, match="lgmd threshold"):
+        assembly.with_detector(robot, lgmd, lgmd.Params(threshold=-1.0))
+
+
+def test_a_detector_keeps_its_cells_with_another_camera(robot):
+    inside = scaled.Params(model=emd, detector=emd.Params(), pooling=3)
+    finer = assembly.with_resolution(
+        assembly.with_detector(robot, scaled, inside), Resolution(width=160, height=120, pooling=6)
+    )
+    assert finer.controller.detector.pooling == assembly.camera_settings(finer).pooling == 6
+    fixed = assembly.with_detector(robot, grm)
+    with pytest.raises(
+        InputError, match=r"parameter pooling for a camera with pooling 6, got one of lgmdjax.detectors.grm"
+    ):
+        assembly.with_resolution(fixed, Resolution(width=160, height=120, pooling=6))
+
+
+OWN = """
+from lgmdjax.detectors.emd import Params, Response, init
+from lgmdjax.detectors import emd
+
+def step(params, state, frame):
+    return emd.step(params, state, {})
+"""
+
+
+def test_fingerprint_tells_detectors_apart_and_knows_the_source_of_your_own(robot, tmp_path, monkeypatch):
+    """One name and equal parameters, in this process and in the next one, where the user has changed the file."""
+    monkeypatch.syspath_prepend(tmp_path)
+    found = [assembly.fingerprint(assembly.with_detector(robot, emd))]
+    inside = scaled.Params(model=emd, detector=emd.Params())
+    found.append(assembly.fingerprint(assembly.with_detector(robot, scaled, inside)))
+    for frame in ("frame", "2.0 * frame"):
+        (tmp_path / "own_detector.py").write_text(OWN.format(frame))
+        monkeypatch.delitem(sys.modules, "own_detector", raising=False)
+        importlib.invalidate_caches()
+        own: Any = importlib.import_module("own_detector")
+        found.append(assembly.fingerprint(assembly.with_detector(robot, own)))
+        assert found[-1] == assembly.fingerprint(assembly.with_detector(robot, own))
+    assert len({assembly.fingerprint(robot), *found}) == 5
 
 
 def test_placeholders_walk_straight():

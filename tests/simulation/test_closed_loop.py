@@ -11,7 +11,7 @@ from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, navigator, policies
 from lgmdjax.detectors import lgmd
 from lgmdjax.sensors import camera
-from lgmdjax.simulation import closed_loop, rollout, room_batches, sharding
+from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches, sharding
 from lgmdjax.world import arena
 
 MIRRORED_LEGS = np.array([5, 4, 3, 2, 1, 0])
@@ -36,9 +36,9 @@ def params():
             policies.ReplayParams(velocities=jnp.asarray([[1.0, 0.5], [0.5, 1.0]])),
         ),
     )
-    return closed_loop.assemble(
+    return assembly.assemble(
         switch,
-        lgmd_params=lgmd.Params(threshold=0.5, suppression=30.0, smooth=True),
+        detector_params=lgmd.Params(threshold=0.5, suppression=30.0, smooth=True),
         camera_params=camera.Params(width=48, height=36, overlap=0.6),
     )
 

@@ -8,7 +8,7 @@ import pytest
 from lgmdjax.body import hexapod
 from lgmdjax.control import policies
 from lgmdjax.sensors import camera
-from lgmdjax.simulation import closed_loop, episodes, rerender, rollout, room_batches
+from lgmdjax.simulation import assembly, episodes, rerender, rollout, room_batches
 
 pytestmark = pytest.mark.optimised
 
@@ -22,14 +22,14 @@ FRAMES = 45  # more than one call of the rendering program, and less than two
 def test_pictures_are_rendered_again_from_the_poses(tmp_path):
     """From Parquet, to the last bit those of the rollout, whichever part of it is rendered."""
     curve = policies.BlindParams(velocity=jnp.asarray([1.0, 0.6]))
-    params, model = closed_loop.assemble(curve, camera_params=CAMERA), hexapod.build()
+    params, model = assembly.assemble(curve, camera_params=CAMERA), hexapod.build()
     rooms = room_batches.random_rooms(jax.random.key(1), ROBOTS, density=0.3)
     blind = policies.BLIND
     states, frames = rollout.reset_batch(params, model, rooms, policy=blind), []
     writer = episodes.Writer(tmp_path, {})
     for _ in range(FRAMES):
         states, chunk = rollout.rollout_batch(params, model, rooms, states, True, policy=blind, frames=1)
-        left, right = np.moveaxis(np.asarray(states.controller.lgmd.frame), 1, 0)
+        left, right = np.moveaxis(np.asarray(states.controller.detector.frame), 1, 0)
         frames.append(np.stack([left, right[..., ::-1]], axis=1))  # the detectors see the outermost column first
         writer.write(chunk, episode=0, rooms=range(ROBOTS), seed=1)
     record = episodes.stack_walks(episodes.read(tmp_path))

@@ -59,7 +59,7 @@ def noise_like(tree, size: float):
 def test_a_joint_fit_trains_weights_and_three_constants_but_no_means_or_widths(params):
     scales = by_name(finetuning.param_scales(params, closed_loop_finetune.JOINT_PARTS))
     trained = {name for name, scale in scales.items() if np.any(scale)}
-    constants = {"lgmd.threshold", "lgmd.suppression", "lgmd.inhibition"}
+    constants = {"detector.threshold", "detector.suppression", "detector.inhibition"}
     assert trained == constants | {name for name in scales if name.startswith(("policy.weights.", "shaping."))}
     own = by_name(params)
     assert all(scales[name] == own[name] for name in constants)
@@ -67,21 +67,21 @@ def test_a_joint_fit_trains_weights_and_three_constants_but_no_means_or_widths(p
     assert float(scales["shaping.w1"]) == pytest.approx(w1, abs=2e-3)
 
 
-@pytest.mark.parametrize("part", ["lgmd.thresh", "eyes", "policy.weight"])
+@pytest.mark.parametrize("part", ["detector.thresh", "eyes", "policy.weight"])
 def test_an_unknown_parameter_is_refused(params, part):
     with pytest.raises(InputError, match=rf"expected some of .*shaping\.w1.* got {part}"):
         finetuning.param_scales(params, ("shaping", part))
 
 
 def test_constants_keep_their_sign_and_zeros_after_any_update(params):
-    scales = finetuning.param_scales(params, ("lgmd", "cpg"))
+    scales = finetuning.param_scales(params, ("detector", "cpg"))
     updates = jax.tree.map(lambda leaf, scale: jnp.sign(scale) * leaf, noise_like(params, 3.0), scales)
     after = finetuning.apply_update(params, updates, scales)
-    for name, leaf in by_name((params.lgmd, params.cpg)).items():
-        np.testing.assert_array_equal(np.sign(leaf), np.sign(by_name((after.lgmd, after.cpg))[name]))
-    assert after.lgmd.kernel[2, 2] == 0 and not np.any(np.diag(after.cpg.coupling))
-    np.testing.assert_allclose(after.lgmd.threshold, params.lgmd.threshold * np.exp(updates.lgmd.threshold))
-    assert after.lgmd.threshold_width == params.lgmd.threshold_width
+    for name, leaf in by_name((params.detector, params.cpg)).items():
+        np.testing.assert_array_equal(np.sign(leaf), np.sign(by_name((after.detector, after.cpg))[name]))
+    assert after.detector.kernel[2, 2] == 0 and not np.any(np.diag(after.cpg.coupling))
+    np.testing.assert_allclose(after.detector.threshold, params.detector.threshold * np.exp(updates.detector.threshold))
+    assert after.detector.threshold_width == params.detector.threshold_width
     jax.tree.map(np.testing.assert_array_equal, (after.policy, after.shaping), (params.policy, params.shaping))
 
 
@@ -102,11 +102,11 @@ def test_finetuned_params_go_into_the_robot_whose_thresholds_stay_hard(robot, pa
     """The robot keeps its structure, so that it runs in the compiled program of all others."""
     changed = jax.tree.map(lambda leaf: 1.01 * leaf, params)
     after = closed_loop_finetune.with_finetuned_params(robot, changed)
-    assert jax.tree.structure(after) == jax.tree.structure(robot) and not after.controller.lgmd.smooth
-    assert after.controller.lgmd.threshold_width == robot.controller.lgmd.threshold_width
+    assert jax.tree.structure(after) == jax.tree.structure(robot) and not after.controller.detector.smooth
+    assert after.controller.detector.threshold_width == robot.controller.detector.threshold_width
     back = rollout_gradient.learned_only(after).controller
     jax.tree.map(np.testing.assert_array_equal, (back.policy, back.shaping), (changed.policy, changed.shaping))
-    expected = {name: 1.01 * float(getattr(params.lgmd, name)) for name in ("threshold", "suppression", "inhibition")}
+    expected = {name: 1.01 * float(getattr(params.detector, name)) for name in lgmd.SCALARS}
     assert closed_loop_finetune.detector_constants(after) == pytest.approx(expected)
 
 
@@ -189,7 +189,7 @@ def test_learners_start_from_their_navigator_with_smooth_thresholds_and_equal_to
     robot = assembly.with_camera(assembly.load_robot(), EYES)
     list(closed_loop_finetune.train_learners(tmp_path, robot, SETTINGS, 0, (5,)))
     assert [float(params.policy.output_mean[0]) for params, _, _ in finetuned] == [0, 0, 0, 1, 0]
-    assert all(params.lgmd.smooth and window.clip == 10 for params, window, _ in finetuned)
+    assert all(params.detector.smooth and window.clip == 10 for params, window, _ in finetuned)
     assert [window.grad_path for _, window, _ in finetuned] == ["controller", *["everything"] * 4]
     assert [settings.trainable for _, _, settings in finetuned] == [
         ("policy",), ("policy",), closed_loop_finetune.JOINT_PARTS, ("policy",), ("policy",)

@@ -118,7 +118,7 @@ def synthetic_step(monkeypatch, unchecked):
 
     def step(params, model, room, state, policy, *, render=True, grad_path="everything"):
         own, before = params.controller, state.controller.velocity
-        numbers = own.lgmd.inhibition, own.cpg.cycle_time, model.pair_solref[0, 0]
+        numbers = own.detector.inhibition, own.cpg.cycle_time, model.pair_solref[0, 0]
         velocity, label = command(before, numbers, state.frame.astype(before.dtype), room.starts[0, 0], jnp)
         record: Any = Commands(velocity=velocity, label=label)
         return replace(state, controller=replace(state.controller, velocity=velocity), frame=state.frame + 1), record
@@ -159,7 +159,7 @@ def test_every_horizon_has_its_derivative_by_all_methods(synthetic_step, tmp_pat
     softness = {"hard": float(model.pair_solref[0, 0]), "soft": float(hexapod.soften_contacts(model).pair_solref[0, 0])}
     assert softness["hard"] != softness["soft"]
     for row in rows:
-        own = np.array([params.lgmd.inhibition, params.cpg.cycle_time, softness[row["contact"]]])
+        own = np.array([params.detector.inhibition, params.cpg.cycle_time, softness[row["contact"]]])
         x, double = float(starts[row["robot"]]), row["precision"] == "float64"
         assert row["loss"] == pytest.approx(expected_loss(row["horizon"], own, own, x), rel=1e-9 if double else 1e-4)
         shifts = 1e-6 * np.diag(np.abs(own) + 1e-6)[:2]  # in units of param_scales

@@ -161,8 +161,8 @@ def test_an_erratum_changes_one_thing(robot):
     ):
         other = errata.CASES[f"sec. 3.3: {part}"](robot, Path())
         assert assembly.camera_settings(other) == replace(eyes, **field) != eyes
-    assert errata.CASES["eq. 16: gate"](robot, Path()).controller.lgmd.printed_gate
-    assert errata.CASES["eq. 15: signed sum"](robot, Path()).controller.lgmd.printed_feed_forward
+    assert errata.CASES["eq. 16: gate"](robot, Path()).controller.detector.printed_gate
+    assert errata.CASES["eq. 15: signed sum"](robot, Path()).controller.detector.printed_feed_forward
     assert errata.CASES["eqs. 1, 3: sign of w_fe"](robot, Path()).controller.cpg.printed_sign
 
 

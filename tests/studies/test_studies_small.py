@@ -62,7 +62,7 @@ def walks(robot, rooms) -> closed_loop.Record:
 
 def respond(robot: closed_loop.Params, rooms: closed_loop.Room, walks: closed_loop.Record) -> lgmd.Response:
     """Render walks for a robot's detectors and return their responses, axes (robot, eye, frame)."""
-    detector = robot.controller.lgmd
+    detector = robot.controller.detector
     pictures = rerender.render_walks(robot.camera, rooms.arena, walks)
 
     def eye(pictures: jax.Array) -> lgmd.Response:
@@ -78,7 +78,7 @@ def unchanged(robot, rooms, walks) -> lgmd.Response:
 
 
 def with_lgmd(robot: closed_loop.Params, **changes) -> closed_loop.Params:
-    return replace(robot, controller=replace(robot.controller, lgmd=replace(robot.controller.lgmd, **changes)))
+    return replace(robot, controller=replace(robot.controller, detector=replace(robot.controller.detector, **changes)))
 
 
 def test_low_contrast_lowers_the_excitation(robot, rooms, walks, unchanged):
@@ -98,7 +98,7 @@ def test_low_T_f_suppresses_u_in_exactly_the_frames_above_it(robot, rooms, walks
 def test_printed_gate_passes_u_above_T_f_only(robot, rooms, walks, unchanged):
     """Eq. 16 as printed is the negation of the corrected gate; a walking robot never exceeds T_f."""
     printed = errata.CASES["eq. 16: gate"](robot, Path())
-    below = unchanged.feed_forward <= float(robot.controller.lgmd.suppression)
+    below = unchanged.feed_forward <= float(robot.controller.detector.suppression)
     assert below.mean() > 0.9
     np.testing.assert_array_equal(respond(printed, rooms, walks).u[below], lgmd.U_AT_REST)
 

@@ -61,9 +61,9 @@ def test_turn_gain_and_speed_scale_turn_and_mean_within_the_range_of_the_gait(ro
 
 
 def test_the_detectors_get_the_constants_of_the_controls(robot):
-    detector = live_step.steer(robot, Controls(threshold=3.0, inhibition=0.7)).controller.lgmd
+    detector = live_step.steer(robot, Controls(threshold=3.0, inhibition=0.7)).controller.detector
     assert (float(detector.threshold), float(detector.inhibition)) == (3.0, 0.7)
-    assert float(detector.suppression) == float(robot.controller.lgmd.suppression)
+    assert float(detector.suppression) == float(robot.controller.detector.suppression)
 
 
 def test_no_control_needs_another_program(robot, room):
