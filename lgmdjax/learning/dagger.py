@@ -7,10 +7,9 @@ The rule costs nothing in simulation, so the navigator's own walks are labelled 
 How much harder than its teacher the final navigator turns (`behaviour_cloning.rescale_turns`) is chosen by walking
 with several gains. Collisions are too rare to compare them by; approaches nearer than `APPROACH_CLEARANCE` are not.
 
-Source: Ross, Gordon & Bagnell 2011 (DAgger); Breiman et al. 1984 (the simplest within one standard error of the best).
+Source: Ross, Gordon & Bagnell 2011 (DAgger).
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -109,11 +108,10 @@ def select_turn_gain(
     *,
     seed: int,
 ) -> tuple[navigator.Params, list[JsonObject]]:
-    """Choose the smallest turn gain whose approaches per distance are within a standard error of the fewest.
+    """Choose the turn gain with the fewest approaches per distance; the smallest gain if several have equally few.
 
     The more a robot turns, the less it approaches anything, and the less floor it sees. Gains with less than
-    `MIN_RELATIVE_COVERAGE` of the best coverage are therefore not chosen. A greater gain that is better by chance alone
-    would only make the robot turn more.
+    `MIN_RELATIVE_COVERAGE` of the best coverage are therefore not chosen.
 
     Args:
         folder: for the walks with each gain, all in the same rooms.
@@ -137,18 +135,10 @@ def select_turn_gain(
         candidates.append(behaviour_cloning.rescale_turns(fit.best, test, turn_gain))
         record = _walk_with_gain(folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed)
         rows.append({"caution": turn_gain} | _summarise(record))
-    best = _choose_gain(rows)
-    return candidates[best], [row | {"chosen": k == best} for k, row in enumerate(rows)]
-
-
-def _choose_gain(rows: Sequence[JsonObject]) -> int:
-    """Return the number of the row whose gain `select_turn_gain` chooses."""
     least = MIN_RELATIVE_COVERAGE * max(row["coverage"] for row in rows)
     going_on = [k for k, row in enumerate(rows) if row["coverage"] >= least]
-    rates = {k: rows[k]["tight"] / rows[k]["distance"] for k in going_on}
-    fewest = min(going_on, key=lambda k: (rates[k], rows[k]["caution"]))
-    error = math.sqrt(max(rows[fewest]["tight"], 1)) / rows[fewest]["distance"]  # of a count, by Poisson
-    return min((k for k in going_on if rates[k] <= rates[fewest] + error), key=lambda k: rows[k]["caution"])
+    best = min(going_on, key=lambda k: (rows[k]["tight"] / rows[k]["distance"], rows[k]["caution"]))
+    return candidates[best], [row | {"chosen": k == best} for k, row in enumerate(rows)]
 
 
 def _summarise(record: closed_loop.Record) -> JsonObject:
