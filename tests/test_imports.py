@@ -13,6 +13,7 @@ WINGS = (
     "viewer",
     "pipeline",
     "studies",
+    "bench",
     "datasets",
     "learning",
     "environments",

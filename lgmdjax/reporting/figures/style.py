@@ -20,6 +20,7 @@ palette of Okabe & Ito, which colour-blind readers can tell apart.
 | `comparison.plot_collisions_against_coverage` | -            | the same against the coverage of every policy        |
 | `stimulus_scores.plot`                        | -            | looming detectors on laboratory stimuli              |
 | `clip_scores.plot_roc`, `plot_clip`           | -            | looming detectors on video clips                     |
+| `detector_walks.plot`                         | -            | looming detectors as the eyes of one robot           |
 """
 
 import io
