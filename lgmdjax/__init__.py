@@ -11,7 +11,8 @@
 | lgmd, cpg, camera, laser, navigator, braitenberg, hexapod | components of one robot, each with `init` and `step` |
 | world, locomotion, body, sensors, detectors, control | the other modules of the robot and its rooms |
 | simulation, deployment, transfer, hardware, reporting, evaluation, learning | what is done with the robot |
-| datasets, environments, viewer, studies, pipeline, cli, runtime | other libraries, browser, studies, commands, files |
+| datasets, environments, viewer, studies, bench | other libraries, browser, questions and comparisons |
+| pipeline, cli, runtime | commands, files |
 
 >>> import jax
 >>> import lgmdjax as lj

@@ -1,5 +1,6 @@
 __version__: str
 
+from . import bench as bench
 from . import body as body
 from . import cli as cli
 from . import control as control

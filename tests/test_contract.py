@@ -165,7 +165,7 @@ COMPONENTS = (
     detector(emd, emd.Params),
     detector(grm, grm.Params, EMD_GAIN),
     detector(lplc2, lambda: replace(lplc2.create(5), intercept=0.3, inhibition_intercept=-0.01), EMD_GAIN),
-    detector(scaled, lambda: scaled.Params(detector=smooth_lgmd(), contrast=1.2, pooling=2)),
+    detector(scaled, lambda: scaled.Params(detector=smooth_lgmd(), contrast=1.2, gain=0.8, pooling=2)),
     replace(detector(eta, eta.Params), inputs=looming_object),
     replace(detector(tau, tau.Params), inputs=looming_object),
     Component(

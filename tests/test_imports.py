@@ -14,6 +14,7 @@ WINGS = (
     "sweeps",
     "pipeline",
     "studies",
+    "bench",
     "datasets",
     "learning",
     "environments",

@@ -1,5 +1,6 @@
-from . import bench as bench
 from . import bench_clips as bench_clips
+from . import bench_closed_loop as bench_closed_loop
+from . import bench_stimuli as bench_stimuli
 from . import calibrate_camera as calibrate_camera
 from . import doctor as doctor
 from . import drive as drive

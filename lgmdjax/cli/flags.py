@@ -151,18 +151,22 @@ class WatchFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchFlags:
-    """The stimuli or clips, and the detectors that are compared on them."""
+    """What the detectors are compared on, and which."""
 
-    on: tyro.conf.Positional[Literal["stimuli", "clips"]]
-    """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos"""
+    on: tyro.conf.Positional[Literal["stimuli", "clips", "closed-loop"]]
+    """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos; closed-loop: walks of
+    the robot that they steer"""
     paths: tyro.conf.Positional[tuple[Path, ...]] = ()
     """with clips, the folder of the videos, and the file of their labels if it is not labels.csv in that folder"""
     detector: tuple[str, ...] = ("all",)
     """detectors by name, or module:attribute for one of your own; all means those of lgmdjax.detectors"""
     scale: BenchScale = "quick"
-    """smoke runs in seconds, quick in a minute, paper has l/|v| from 10 ms to 2 s"""
+    """smoke goes through every step; quick takes a minute, in the closed loop half an hour; full has l/|v| from 10 ms
+    to 2 s, and three navigators for each detector in the closed loop"""
     seed: int = 0
-    """seed of the noise"""
+    """seed of the noise, the rooms and the training"""
+    run: Path | None = None
+    """run folder of the robot that walks; the pretrained robot if left out"""
     out: Path = Path("runs/bench")
     """folder that holds one folder for each benchmark and scale"""
 

@@ -186,15 +186,16 @@ def sim_robot(arguments: Sequence[str]) -> None:
 
 
 def bench(arguments: Sequence[str]) -> None:
-    """Compare looming detectors on laboratory stimuli or labelled videos: table, JSON, figure, page."""
+    """Compare looming detectors on laboratory stimuli, on labelled videos, or as the eyes of the robot."""
     from lgmdjax.cli import flags
 
     given = flags.parse_bench(_summary(bench), arguments)
     environment.check_jax()
-    from lgmdjax.cli.bench import run_bench
     from lgmdjax.cli.bench_clips import run_clips
+    from lgmdjax.cli.bench_closed_loop import run_closed_loop
+    from lgmdjax.cli.bench_stimuli import run_stimuli
 
-    for line in run_clips(given) if given.on == "clips" else run_bench(given):
+    for line in {"stimuli": run_stimuli, "clips": run_clips, "closed-loop": run_closed_loop}[given.on](given):
         print(line, flush=True)
 
 

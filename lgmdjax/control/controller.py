@@ -90,21 +90,32 @@ def rest(dtype: DTypeLike = float) -> Response:
     )
 
 
+def step_detectors(params: Params, states: PyTree, frames: Frames) -> tuple[PyTree, Response]:
+    """Return the next states of both detectors, and their responses to a stereo frame (eqs. 7-16)."""
+
+    def step(state: PyTree, frame: Array) -> tuple[PyTree, tuple[Array, Array, Array]]:
+        state, own = params.detector_model.step(params.detector, state, frame)
+        return state, (own.u, getattr(own, "feed_forward", jnp.zeros_like(own.u)), own.excitation)
+
+    states, (u, feed_forward, excitation) = jax.vmap(step)(states, hemifield.outermost_first(frames))
+    return states, Response(u=u, feed_forward=feed_forward, excitation=excitation)
+
+
+def restart_detectors(params: Params, states: PyTree, frames: Frames, is_first: Bool[Array, ""]) -> PyTree:
+    """Return the states of both detectors before a stereo frame: those of `init_detectors` for a first one."""
+    started = init_detectors(params, frames)
+    return jax.tree.map(lambda new, old: jnp.where(is_first, new, old), started, states)
+
+
 def detect(params: Params, state: State, frames: Frames) -> tuple[State, Response]:
-    """Step both detectors by one stereo frame (eqs. 7-16); the response has one entry for each eye, left first."""
-    frames = hemifield.outermost_first(frames)
-    step = jax.vmap(params.detector_model.step, in_axes=(None, 0, 0))
-    detector_state, own = step(params.detector, state.detector, frames)
-    response = Response(
-        u=own.u, feed_forward=getattr(own, "feed_forward", jnp.zeros_like(own.u)), excitation=own.excitation
-    )
-    return replace(state, detector=detector_state), response
+    """Step both detectors by one stereo frame; the response has one entry for each eye, left first."""
+    states, response = step_detectors(params, state.detector, frames)
+    return replace(state, detector=states), response
 
 
 def detect_or_start(params: Params, state: State, frames: Frames, is_first: Bool[Array, ""]) -> tuple[State, Response]:
     """Step both detectors as `detect` does; a first frame starts from the states of `init_detectors`."""
-    started = init_detectors(params, frames)
-    before = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), started, state.detector)
+    before = restart_detectors(params, state.detector, frames, is_first)
     return detect(params, replace(state, detector=before), frames)
 
 

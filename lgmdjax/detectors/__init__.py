@@ -12,7 +12,7 @@
 | grm            | Chalupka et al. 2016: generalised regressive motion                        |
 | lplc2          | fruit fly, Klapoetke et al. 2017 and Zhou et al. 2022: outward motion      |
 | eta, tau       | ideal observers, given the true geometry: Gabbiani et al. 1999, Lee 1976   |
-| scaled         | any of them, with other cells and a contrast gain: for another camera      |
+| scaled         | any of them with other cells and gains, for another camera                 |
 | alarm          | for any of them: an adaptive scale, a threshold and a minimum duration     |
 | cells, on_off  | what several of them share                                                 |
 """

@@ -10,13 +10,14 @@ from front to back and is not detected.
 | R      | -                   | 1      | motion to the right, `lgmdjax.detectors.emd`      |
 | g_l    | response.left       | 1      | mean of max(R, 0) over the left half of the frame |
 | g_r    | response.right      | 1      | mean of max(-R, 0) over the right half            |
-| E      | response.excitation | 1      | g_l + g_r                                         |
+| E      | response.excitation | 1      | g_l + g_r; of a hemifield the mean of max(R, 0)   |
 | u      | response.u          | 0.5..1 | 1 / (1 + exp(-gain E))                            |
 
 Source: Chalupka, Dickinson & Perona, "Generalized regressive motion: a visual cue to collision", Bioinspiration &
 Biomimetics 11, 2016, after Zabala et al. 2012, for the cue; only the abstracts were available. Chosen here: the motion
 comes from correlators, is rectified cell by cell and averaged over a hemifield; gain = 1000, as in emd. The middle
-column of detectors belongs to neither half.
+column of detectors belongs to neither half. With `hemifield` the frame is that of the robot's eyes: one half of the
+view, the outermost column first, so that motion to the right is regressive everywhere.
 
 Gradient: exact almost everywhere.
 """
@@ -38,6 +39,7 @@ class Params:
 
     motion: emd.Params = struct.field(default_factory=emd.Params)
     gain: Scalar = 1000.0
+    hemifield: bool = struct.field(pytree_node=False, default=False)  # the frame is the left half of the view
 
 
 @struct.dataclass(kw_only=True)
@@ -73,7 +75,10 @@ def step(params: Params, state: State, frame: Float[Array, "height width"]) -> t
     """
     state = emd.filter_frame(params.motion, state, frame)
     R = emd.correlate(state).rightward
-    half = R.shape[1] // 2
-    left, right = jnp.mean(rectify(R[:, :half])), jnp.mean(rectify(-R[:, R.shape[1] - half :]))
+    if params.hemifield:
+        left, right = jnp.mean(rectify(R)), jnp.zeros((), R.dtype)
+    else:
+        half = R.shape[1] // 2
+        left, right = jnp.mean(rectify(R[:, :half])), jnp.mean(rectify(-R[:, R.shape[1] - half :]))
     E = left + right
     return state, Response(u=jax.nn.sigmoid(params.gain * E), excitation=E, left=left, right=right)

@@ -14,11 +14,13 @@ ideal observers have it too, but get the object's true size instead of a frame.
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PyTree
 
@@ -100,8 +102,7 @@ def check(detector: Detector, params: PyTree, frame: jax.ShapeDtypeStruct) -> No
         hash(detector)
         getattr(detector, "check", lambda _: None)(params)
         before = jax.eval_shape(detector.init, params, frame)
-        after, response = jax.eval_shape(detector.step, params, before, frame)
-        outputs = {part: getattr(response, part).shape for part in ("u", "excitation")}
+        after, outputs = jax.eval_shape(partial(_outputs, detector), params, before, frame)
     except InputError:
         raise
     except Exception as error:  # whatever the code of a user raises
@@ -111,8 +112,14 @@ def check(detector: Detector, params: PyTree, frame: jax.ShapeDtypeStruct) -> No
         ) from error
     if jax.tree.structure(before) != jax.tree.structure(after) or _types(before) != _types(after):
         raise InputError(f"{called}: expected a state like {before} after a step, got {after}; keep shapes and types")
-    if any(shape != () for shape in outputs.values()):
-        raise InputError(f"{called}: expected one u and one excitation a frame, got shapes {outputs}; reduce them")
+    shapes = {part: output.shape for part, output in outputs.items()}
+    if any(shape != () for shape in shapes.values()):
+        raise InputError(f"{called}: expected one u and one excitation a frame, got shapes {shapes}; reduce them")
+
+
+def _outputs(detector: Detector, params: PyTree, state: PyTree, frame: Array) -> tuple[PyTree, dict[str, Array]]:
+    state, response = detector.step(params, state, frame)
+    return state, {part: jnp.asarray(getattr(response, part)) for part in ("u", "excitation")}
 
 
 def _types(tree: PyTree) -> list[tuple[tuple[int, ...], Any]]:

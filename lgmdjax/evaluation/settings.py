@@ -13,7 +13,7 @@ TrialName = Literal[
 """The trials of `lgmdjax.evaluation.trials`, in the order of its `TRIALS`."""
 
 
-BenchScale = Literal["smoke", "quick", "paper"]
+BenchScale = Literal["smoke", "quick", "full"]
 """Scales of `lgmdjax bench`."""
 
 
@@ -30,9 +30,9 @@ class StimulusBench:
 STIMULUS_SCALES: dict[str, StimulusBench] = {
     "smoke": StimulusBench(width=32, height=24, l_over_v=(0.03, 0.06, 0.12)),
     "quick": StimulusBench(width=80, height=60, l_over_v=(0.01, 0.02, 0.05, 0.1, 0.2, 0.4)),
-    "paper": StimulusBench(width=160, height=120, l_over_v=(0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)),
+    "full": StimulusBench(width=160, height=120, l_over_v=(0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)),
 }
-"""smoke runs in seconds, quick in a minute, paper has l/|v| from 10 ms to 2 s."""
+"""smoke runs in seconds, quick in a minute, full has l/|v| from 10 ms to 2 s."""
 
 
 @dataclass(frozen=True, kw_only=True)

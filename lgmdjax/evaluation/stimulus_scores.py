@@ -58,6 +58,11 @@ class DetectorSetup(NamedTuple):
     detector: protocol.Detector
     params: Callable[[camera.Params], PyTree]
     is_ideal: bool = False
+    own_hemifield: Callable[[], PyTree] | None = None
+
+    def hemifield(self) -> PyTree:
+        """Return its published parameters for a robot's eye: one half of the view, the outermost column first."""
+        return self.detector.Params() if self.own_hemifield is None else self.own_hemifield()
 
 
 class StimulusClips(NamedTuple):
@@ -85,7 +90,9 @@ DETECTORS: Mapping[str, DetectorSetup] = {
     "d_lgmd": _published(d_lgmd),
     "dsn": _published(dsn),
     "emd": DetectorSetup(emd, _correlators),
-    "grm": DetectorSetup(grm, lambda eye: grm.Params(motion=_correlators(eye))),
+    "grm": DetectorSetup(
+        grm, lambda eye: grm.Params(motion=_correlators(eye)), own_hemifield=lambda: grm.Params(hemifield=True)
+    ),
     "lplc2": DetectorSetup(lplc2, lambda eye: lplc2.Params(motion=_correlators(eye))),
     "eta": _published(eta, is_ideal=True),
     "tau": _published(tau, is_ideal=True),

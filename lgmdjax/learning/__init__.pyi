@@ -1,6 +1,8 @@
 from . import behaviour_cloning as behaviour_cloning
 from . import checkpoints as checkpoints
 from . import dagger as dagger
+from . import detector_calibration as detector_calibration
+from . import detector_responses as detector_responses
 from . import finetuning as finetuning
 from . import gait_objective as gait_objective
 from . import lgmd_gradient_fit as lgmd_gradient_fit

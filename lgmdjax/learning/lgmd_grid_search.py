@@ -39,6 +39,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
+from lgmdjax.control import braitenberg
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation.metrics import AVERAGING_TIME
@@ -50,6 +51,12 @@ from lgmdjax.world import arena
 THRESHOLDS = (0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # candidates for T_s, grey
 INHIBITIONS = (0.1, 0.2, 0.3, 0.4)  # candidates for W_I; the paper's is 0.4
 SUPPRESSION_MARGIN = 1.25  # T_f relative to the largest FF of walking
+CALIBRATION_RULE = braitenberg.Params(corridor=0.0, turn_distance=0.95, full_turn_distance=0.6)
+"""The rule of the calibration walks, which turns away from everything near.
+
+T_f has to be above the FF values of hard turns. The teacher's own walks have too few of them: T_f became half as large,
+and the detectors of a robot that had to turn were suppressed.
+"""
 
 
 @struct.dataclass(kw_only=True)
@@ -128,7 +135,7 @@ def select(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: 
     Raises InputError if there are less than 10 s of steady walking, or responses that are not finite.
     """
     record = finite.require_finite(record, "calibration")
-    steady = _is_steady_walking(record)
+    steady = is_steady_walking(record)
     if steady.sum() < 10 * FRAME_RATE:
         raise InputError(
             f"calibration: expected 10 s or more of walking, got {steady.sum() / FRAME_RATE:.1f} s; "
@@ -141,7 +148,7 @@ def select(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: 
     averaged = ndimage.uniform_filter1d(np.asarray(u), round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
     pairs = zip(candidates.threshold.tolist(), candidates.inhibition.tolist(), strict=True)
     table = [
-        {"threshold": T_s, "inhibition": W_I, **_correlations(averaged[..., k], proximity[steady])}
+        {"threshold": T_s, "inhibition": W_I, **correlations(averaged[..., k], proximity[steady])}
         for k, (T_s, W_I) in enumerate(pairs)
     ]
     best = max(table, key=lambda row: row["score"])
@@ -151,14 +158,14 @@ def select(record: Record, u: np.ndarray, feed_forward: np.ndarray, candidates: 
 
 def correlate_with_proximity(record: Record) -> dict[str, float]:
     """Return the correlations of the recorded u with proximity, by which `select` compares candidates."""
-    steady = _is_steady_walking(record)
+    steady = is_steady_walking(record)
     averaged = ndimage.uniform_filter1d(np.asarray(record.u), round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
     if not steady.any():  # as for a robot that falls at once
         return dict.fromkeys(("score", "left", "right"), 0.0)
-    return _correlations(averaged, 1 / np.asarray(record.distances)[steady])
+    return correlations(averaged, 1 / np.asarray(record.distances)[steady])
 
 
-def _is_steady_walking(record: Record) -> Bool[np.ndarray, "robots frames"]:
+def is_steady_walking(record: Record) -> Bool[np.ndarray, "robots frames"]:
     """Flag frames whose averaging window, and half a window on either side of it, contain nothing but walking."""
     walking = np.asarray(record.ok) & ~np.asarray(record.contact) & ~np.asarray(record.is_first)
     window = round(AVERAGING_TIME * FRAME_RATE)
@@ -166,7 +173,7 @@ def _is_steady_walking(record: Record) -> Bool[np.ndarray, "robots frames"]:
     return ndimage.minimum_filter1d(walking.astype(np.uint8), 2 * window + 1, axis=1, mode="constant").astype(bool)
 
 
-def _correlations(u: Float[np.ndarray, "frames 2"], proximity: Float[np.ndarray, "frames 2"]) -> dict[str, float]:
+def correlations(u: Float[np.ndarray, "frames 2"], proximity: Float[np.ndarray, "frames 2"]) -> dict[str, float]:
     """Correlate u with 1/d on each side, and the left-right differences of both, which is the score."""
 
     def correlation(a: np.ndarray, b: np.ndarray) -> float:

@@ -20,12 +20,6 @@ from lgmdjax.simulation import assembly, closed_loop, episodes, recording, rollo
 from lgmdjax.simulation.assembly import load_detector
 
 CALIBRATION_EPISODE = 2**20  # an episode number beyond all others: its rooms are used nowhere else
-CALIBRATION_RULE = braitenberg.Params(corridor=0.0, turn_distance=0.95, full_turn_distance=0.6)
-"""The rule of the calibration walks, which turns away from everything near.
-
-T_f has to be above the FF values of hard turns. The teacher's own walks have too few of them: T_f became half as large,
-and the detectors of a robot that had to turn were suppressed.
-"""
 
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, seed: int) -> None:
@@ -49,7 +43,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, see
 def _calibrate(gait: Path, settings: CollectSettings, seed: int) -> JsonObject:
     """Record walks of the teacher without rendering, render them for all candidates, and select the thresholds."""
     detector = assembly.fit_detector(lgmd.Params(), settings.eyes)
-    params = assembly.with_teacher(_teacher_robot(gait, settings, detector), CALIBRATION_RULE)
+    params = assembly.with_teacher(_teacher_robot(gait, settings, detector), lgmd_grid_search.CALIBRATION_RULE)
     rooms, seconds = (
         room_batches.training_rooms(seed, CALIBRATION_EPISODE, settings.robots),
         settings.calibration_seconds,

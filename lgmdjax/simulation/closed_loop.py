@@ -43,6 +43,7 @@ GradPath = Literal["controller", "body", "everything"]
 
 FRAME_RATE = 30.0  # Hz, of the camera (paper sec. 3.1)
 PATH_STRIDE = 8  # frames between two points of a path that a notebook shows
+CAMERAS = 2**31  # folded into a room's key for its cameras, beyond any number of resets
 SUBSTEPS = 6  # physics steps a frame; the time step in the robot's XML is 1 / (FRAME_RATE * SUBSTEPS)
 
 
@@ -147,7 +148,7 @@ def init(params: Params, model: mjx.Model, room: Room, policy: Policy) -> State:
         is_first=jnp.asarray(True),
         contact=jnp.asarray(False),
         ok=jnp.asarray(True),
-        cameras=None if faults is None else faulty_cameras.init(faults, black, jax.random.fold_in(room.key, -1)),
+        cameras=None if faults is None else faulty_cameras.init(faults, black, jax.random.fold_in(room.key, CAMERAS)),
     )
 
 

@@ -7,6 +7,8 @@ they were. Until the first one after a start or reset arrives, the responses are
 Vignetting depends on the whole picture, which the closed loop does not render: `check` refuses it.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,14 +25,14 @@ Pictures = Float[Array, "2 height columns"]
 class State:
     """State of both cameras."""
 
-    cameras: camera_faults.State
+    cameras: camera_faults.State  # its key as numbers: a program on disk cannot return keys from several devices
     arrived: Bool[Array, ""]  # a picture arrived in this frame
     is_waiting: Bool[Array, ""]  # none did between the start or reset and this frame
 
 
 def init(faults: camera_faults.Params, pictures: Pictures, key: Array) -> State:
     """Return the state at a start, where `pictures` are the first ones."""
-    cameras = camera_faults.init(faults, pictures, key)
+    cameras = _without_key(camera_faults.init(faults, pictures, key))
     return State(cameras=cameras, arrived=jnp.asarray(False), is_waiting=jnp.asarray(True))
 
 
@@ -41,11 +43,16 @@ def step(
 
     If they are the first ones after a reset, the cameras start again; their random numbers go on.
     """
-    started = init(faults, pictures, state.cameras.key)
+    key = jax.random.wrap_key_data(state.cameras.key)
+    started = init(faults, pictures, key)
     state = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), started, state)
-    cameras, delivery = camera_faults.step(faults, state.cameras, pictures)
+    cameras, delivery = camera_faults.step(faults, replace(state.cameras, key=key), pictures)
     is_waiting = state.is_waiting & ~state.arrived
-    return State(cameras=cameras, arrived=delivery.arrived, is_waiting=is_waiting), delivery.pictures
+    return State(cameras=_without_key(cameras), arrived=delivery.arrived, is_waiting=is_waiting), delivery.pictures
+
+
+def _without_key(cameras: camera_faults.State) -> camera_faults.State:
+    return replace(cameras, key=jax.random.key_data(cameras.key))
 
 
 def check(faults: camera_faults.Params) -> None:

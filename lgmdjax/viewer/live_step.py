@@ -123,11 +123,8 @@ def replay(
     def step(state: lgmd.State, at: Poses) -> tuple[lgmd.State, SensedFrame]:
         pictures = _render_whole(params, with_centres(room, at.centres), at.position, at.quaternion)
         frames = _crop(params.camera, pictures)
-        first = controller.init_detectors(params.controller, frames)
-        before = jax.tree.map(lambda new, old: jnp.where(at.is_first, new, old), first, state)
-        after, _ = jax.vmap(lgmd.step, in_axes=(None, 0, 0))(
-            params.controller.detector, before, hemifield.outermost_first(frames)
-        )
+        before = controller.restart_detectors(params.controller, state, frames, at.is_first)
+        after, _ = controller.step_detectors(params.controller, before, frames)
         layers = _layers(params.controller.detector, before.difference, after, at.is_first)
         return after, SensedFrame(pictures=_to_bytes(pictures), layers=layers)
 

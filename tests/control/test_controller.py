@@ -119,7 +119,7 @@ def test_an_object_with_the_interface_is_a_detector():
     [
         (Integers(), "detector Integers: expected a state like .* after a step, got .*; keep shapes and types"),
         (Maps(), r"detector Maps: expected one u and one excitation a frame, got shapes .*\(12, 16\)"),
-        (Silent(), "detector Silent: expected init and step for a frame of float64 .*, got .*'u'"),
+        (Silent(), "detector Silent: expected init and step for a frame of float64 .*, got .*attribute u"),
         (eta, "detector eta: expected init and step for a frame"),
         (SimpleNamespace(Params=lgmd.Params, init=Fine.init, step=Fine.step), "detector SimpleNamespace: .*unhashable"),
     ],

@@ -28,6 +28,13 @@ def test_grm_equals_the_equations_cell_by_cell(strict):
         clips.assert_equals_reference(response, reference.grm(frames), ("u", "excitation", "left", "right"), 1e-6)
 
 
+def test_grm_of_a_hemifield_takes_all_motion_to_the_right(strict):
+    response = clips.respond(grm, grm.Params(hemifield=True), FRAMES)
+    rightward = [np.maximum(reference.motion(H, D)[0], 0).mean() for H, D in reference.signals(FRAMES)]
+    np.testing.assert_allclose(response.excitation, rightward, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(response.left, response.excitation)
+
+
 def test_lplc2_equals_the_equations_cell_by_cell(strict):
     response = clips.respond(lplc2, replace(lplc2.create(5), intercept=-0.1), FRAMES)
     clips.assert_equals_reference(response, reference.lplc2(FRAMES, b_e=-0.1), ("u", "excitation"), 1e-6)

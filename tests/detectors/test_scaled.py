@@ -1,4 +1,4 @@
-"""A detector behind coarser cells and a contrast gain: what it gets, against NumPy, and what is refused."""
+"""A detector with other cells and gains: what it gets and gives, against NumPy, and what is refused."""
 
 from functools import partial
 
@@ -39,7 +39,17 @@ def test_any_detector_can_be_inside():
     inside = respond(scaled.Params(model=d_lgmd, detector=own, contrast=2.0), FRAMES)
     images = jnp.asarray(2.0 * FRAMES)
     alone = jax.lax.scan(partial(d_lgmd.step, own), d_lgmd.init(own, images[0]), images[1:])[1]
-    jax.tree.map(np.testing.assert_array_equal, inside, alone)
+    for name in ("u", "feed_forward", "excitation"):
+        np.testing.assert_allclose(getattr(inside, name), getattr(alone, name), rtol=1e-9)
+
+
+def test_the_response_gain_multiplies_the_excitation_of_a_logistic_function():
+    """For the LGMD, whose u is the logistic function of its excitation, and so far below where it is 1."""
+    own = lgmd.Params(threshold=0.5, suppression=1e3)
+    response = respond(scaled.Params(detector=own, gain=0.3), FRAMES)
+    np.testing.assert_allclose(response.u, 1 / (1 + np.exp(-0.3 * np.asarray(response.excitation))), rtol=1e-9)
+    with jax.enable_x64(False):
+        assert np.isfinite(scaled.expand(jnp.ones(2, jnp.float32), 3.0)).all()
 
 
 @pytest.mark.parametrize(
@@ -47,6 +57,7 @@ def test_any_detector_can_be_inside():
     [
         ({"contrast": 0.0}, "scaled contrast: expected a positive number, got 0.0"),
         ({"contrast": float("inf")}, "scaled contrast"),
+        ({"gain": -1.0}, "scaled gain: expected a positive number, got -1.0"),
         ({"pooling": 0}, "scaled pooling: expected 1 pixel or more a cell, got 0"),
         ({"detector": lgmd.Params(threshold=-1.0)}, "lgmd threshold"),
         ({"model": eta, "detector": eta.Params(delay=9.0)}, "eta delay"),

@@ -9,8 +9,9 @@ import pytest
 
 from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, navigator, policies
-from lgmdjax.detectors import lgmd
-from lgmdjax.sensors import camera
+from lgmdjax.detectors import emd, lgmd, scaled
+from lgmdjax.errors import InputError
+from lgmdjax.sensors import camera, camera_faults
 from lgmdjax.simulation import assembly, closed_loop, rollout, room_batches, sharding
 from lgmdjax.world import arena
 
@@ -154,6 +155,58 @@ def test_blind_rollout_is_the_same_without_rendering(start, room, run):
     _, record = run(policies.BLIND, room, start, render=False)
     np.testing.assert_allclose(record.position, rendered.position, atol=1e-9)
     np.testing.assert_array_equal(record.u, 0.5)
+
+
+def faulty(room: closed_loop.Room, **faults: float) -> closed_loop.Room:
+    leaves = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.int32 if isinstance(leaf, int) else float), faults)
+    return replace(room, faults=replace(camera_faults.Params(), **leaves))
+
+
+def test_responses_rest_until_the_first_late_picture_and_are_those_of_late_pictures(params, model, room, monkeypatch):
+    """With pictures that are two frames late; those of the scene are replaced by noise."""
+    pictures = jnp.round(
+        jax.random.uniform(jax.random.key(7), (8, *camera.image_shape(params.camera)), minval=0, maxval=9)
+    )
+    ranges = jnp.full(params.laser.rays, 5.0)
+    monkeypatch.setattr(closed_loop, "sense", lambda params, scene, state, render: (pictures[state.frame], ranges))
+
+    @jax.jit
+    def see(room):
+        def frame(state, _):
+            after, seen = closed_loop.observe(params, room.arena, state, True, room.faults)
+            return replace(after, frame=state.frame + 1, is_first=jnp.asarray(False)), seen.excitation
+
+        return jax.lax.scan(frame, closed_loop.init(params, model, room, policies.SWITCH), length=8)[1]
+
+    clear, late = see(room), see(faulty(room, latency=2))
+    np.testing.assert_array_equal(late[:3], 0)
+    assert np.all(np.asarray(clear)[1:] > 0)
+    np.testing.assert_allclose(late[2:], clear[:-2], rtol=1e-6)
+
+
+def test_a_robot_that_does_not_see_in_every_frame_has_no_faulty_cameras(params, model, room):
+    seldom = replace(params, frame_stride=jnp.asarray(2))
+    with pytest.raises(InputError, match="expected a robot that sees in every frame in rooms with camera faults"):
+        closed_loop.init(seldom, model, faulty(room, noise=1.0), policies.SWITCH)
+
+
+@pytest.mark.extended
+def test_another_detector_steers_with_faulty_cameras(params, model, room):
+    """Of four robots, two on each device, the last without noise; `make test` covers the parts."""
+    inside = scaled.Params(model=emd, detector=emd.Params(), contrast=4.0, pooling=2)
+    robot = assembly.with_detector(
+        activated(params, jnp.asarray(policies.POLICIES.index(policies.DIRECT))), scaled, inside
+    )
+    noise = jnp.asarray([1.0, 1.0, 1.0, 0.0])
+    rooms = room_batches.stack_rooms([faulty(room, noise=float(level)) for level in noise])
+    rooms = replace(rooms, key=jax.random.split(jax.random.key(1), 4))
+    chunks = rollout.rollout_chunks(robot, model, rooms, policies.SWITCH, FRAMES / 30, chunk_seconds=FRAMES / 30)
+    record = rollout.concatenate_time(list(chunks))
+    assert record.ok.all() and np.all(record.feed_forward == 0) and np.all(record.u[:, 0] == 0.5)
+    u = record.u[:, 5:]
+    assert np.all(u.max(axis=(1, 2)) > 0.5)
+    assert len({float(each.sum()) for each in u}) == 4  # noise of their own
+    assert np.ptp(record.velocity) > 0
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from lgmdjax.runtime.storage import JsonObject
 COLUMNS = ("detector", "AUC dark", "AUC bright", *figure.GROUPS, "slope", "intercept [ms]", "r")
 
 
-def run_bench(flags: BenchFlags) -> Iterator[str]:
+def run_stimuli(flags: BenchFlags) -> Iterator[str]:
     """Score the detectors; yield a line about each, then the names of the files."""
     names = list(dict.fromkeys(name for given in flags.detector for name in _expand(given)))
     for name in names:
