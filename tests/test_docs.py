@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -85,3 +86,11 @@ def test_the_detector_of_the_how_to_sees_an_approach():
     response = names["response"]
     u = vars(response)["u"]
     assert isinstance(u, jax.Array) and u[-1] > 1.05 * u[3]
+
+
+@pytest.mark.usefixtures("float32")
+def test_the_pendulum_of_the_how_to_is_steered_by_its_gradient():
+    (program,) = python_blocks(ROOT / "docs" / "howto" / "physics.md")
+    names: dict[str, Any] = {"__name__": "physics"}
+    exec(compile(program, "physics.md", "exec"), names)
+    assert float(names["miss"](names["torque"])) < 1e-6 < float(names["miss"](0 * names["torque"]))
