@@ -90,3 +90,11 @@ def test_the_detector_of_the_how_to_sees_an_approach_and_fits_into_the_robot(tmp
     names: dict[str, Any] = {"lj": own.lj}
     exec(compile(assembled, "detector.md", "exec"), names)
     assert names["robot"].controller.detector.model is own
+
+
+@pytest.mark.usefixtures("float32")
+def test_the_pendulum_of_the_how_to_is_steered_by_its_gradient():
+    (program,) = python_blocks(ROOT / "docs" / "howto" / "physics.md")
+    names: dict[str, Any] = {"__name__": "physics"}
+    exec(compile(program, "physics.md", "exec"), names)
+    assert float(names["miss"](names["torque"])) < 1e-6 < float(names["miss"](0 * names["torque"]))

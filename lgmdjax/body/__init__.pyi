@@ -1,3 +1,4 @@
+from . import custom_robot as custom_robot
 from . import hexapod as hexapod
 from . import implicit_step as implicit_step
 from . import robot_xml as robot_xml

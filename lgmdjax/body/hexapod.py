@@ -1,7 +1,8 @@
 """The robot's body: the MuJoCo model of a hexapod of the PhantomX AX Mark II class, its sensors' poses and its physics.
 
-`mjcf/hexapod.xml` defines every mass, length, limit and gain, with its source. This module maps the names in that file
-to static indices and reads poses from `mjx.Data`.
+`mjcf/hexapod.xml` defines every mass, length, limit and gain, with its source. This module finds indices by the names
+in that file, which are static in a model, and reads poses from `mjx.Data`. A body of one's own
+(`lgmdjax.body.custom_robot`) has the same names.
 
 The `mjx.Model` is an argument everywhere, so that `vmap` gives each robot its own room. The obstacles of a room are not
 part of the model. Instead it has one plane, a barrier, for each geom that collides with obstacles, and `place_barriers`
@@ -16,8 +17,8 @@ may collide.
 World and trunk frames: x forward, y left, z up.
 """
 
-from functools import cache
-from typing import NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,9 +29,15 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from lgmdjax.body import implicit_step
+from lgmdjax.body.robot_xml import CAPSULES as CAPSULES
+from lgmdjax.body.robot_xml import EYES as EYES
 from lgmdjax.body.robot_xml import JOINTS as JOINTS
 from lgmdjax.body.robot_xml import LEGS as LEGS
+from lgmdjax.body.robot_xml import Body as Body
+from lgmdjax.body.robot_xml import Offset, sensor_mounts
 from lgmdjax.body.robot_xml import load as load
+from lgmdjax.body.robot_xml import stance as stance
+from lgmdjax.body.robot_xml import target_limits as target_limits
 from lgmdjax.body.robot_xml import xml_path as xml_path
 from lgmdjax.errors import InputError
 from lgmdjax.geometry import rotation_matrix
@@ -39,9 +46,9 @@ from lgmdjax.world import arena
 
 Tree = TypeVar("Tree")
 
-EYES = ("eye_left", "eye_right")
-CAPSULES = ("bumper", *(f"{leg}_{part}" for leg in LEGS for part in JOINTS[1:]))  # geoms that collide with obstacles
-MIN_TRUNK_HEIGHT, MAX_TRUNK_HEIGHT = 0.04, 0.30  # m; range of the trunk of a robot that stands on its feet
+BARRIERS = tuple(f"before_{name}" for name in CAPSULES)  # planes, one for each capsule
+FEET = tuple(f"{leg}_foot" for leg in LEGS)  # spheres that stand on the floor
+MIN_TRUNK_HEIGHT, MAX_TRUNK_HEIGHT = 0.366, 2.74  # of the height in the stance: 4 to 30 cm for the package's robot
 MIN_UPRIGHT = 0.7  # cosine of the trunk's tilt; below it (45 degrees) the robot has fallen
 
 
@@ -53,30 +60,19 @@ class Pose:
     quaternion: Float[Array, "4"]  # w x y z
 
 
-class _Anatomy(NamedTuple):
-    """Indices and offsets in the XML, read once."""
-
-    stance: np.ndarray  # (25,) qpos of the default stance
-    limits: np.ndarray  # (2, 6, 3) rad, lowest and highest set points of the servos
-    eyes: np.ndarray  # (2, 3) m, in the trunk's frame
-    laser: np.ndarray  # (3,) m, in the trunk's frame
-    capsules: np.ndarray  # (13,) ids of `CAPSULES`
-    feet: np.ndarray  # (6,) ids of the geoms that stand on the floor
-    barriers: np.ndarray  # (13,) ids of planes, one for each capsule
-    geom_names: tuple[str, ...]  # all geoms
-
-
 def build(model: mujoco.MjModel | None = None) -> mjx.Model:
     """Convert the robot (default: `load()`) to an MJX model, in JAX's current default precision.
 
-    Raises InputError for a variant whose geoms differ from those of the package's XML, or have another order.
+    Raises InputError for a variant that lacks one of the names that this module uses.
     """
     model = load() if model is None else model
-    for expected, found in zip(_anatomy().geom_names, _geom_names(model), strict=False):
-        if found != expected:
+    kinds = {"geom": (*CAPSULES, *BARRIERS, *FEET), "site": (*EYES, "laser"), "key": ("stance",)}
+    for kind, names in kinds.items():
+        ids = {getattr(model, kind)(index).name for index in range(getattr(model, f"n{kind}"))}
+        if missing := [name for name in names if name not in ids]:
             raise InputError(
-                f"expected the geoms of this package's hexapod.xml in their order, got {found or 'one without a name'} "
-                f"for {expected}; start from that file, and add other geoms at its end"
+                f"expected a {kind} {missing[0]}, as in this package's hexapod.xml, got none; start from that file, or "
+                "describe the robot in a TOML file (docs/howto/robot.md)"
             )
     with jax.numpy_dtype_promotion("standard"):
         return _uncommit(mjx.put_model(model, impl="jax"))
@@ -93,29 +89,14 @@ def soften_contacts(model: mjx.Model) -> mjx.Model:
     return model.replace(pair_solref=solref, pair_solimp=solimp)
 
 
-@cache
-def _anatomy() -> _Anatomy:
-    """Read indices and offsets from the XML."""
-    model = load()
-
-    def geom_ids(names: list[str]) -> np.ndarray:
-        # 32 bits in both precisions: JAX caches a 64-bit array in the precision of its first use.
-        return np.array([model.geom(name).id for name in names], dtype=np.int32)
-
-    return _Anatomy(
-        stance=model.key("stance").qpos.copy(),
-        limits=model.actuator_ctrlrange.T.reshape(2, 6, 3).copy(),
-        eyes=np.stack([model.site(name).pos for name in EYES]),
-        laser=model.site("laser").pos.copy(),
-        capsules=geom_ids([*CAPSULES]),
-        feet=geom_ids([f"{leg}_foot" for leg in LEGS]),
-        barriers=geom_ids([f"before_{name}" for name in CAPSULES]),
-        geom_names=_geom_names(model),
-    )
+def _geom_ids(model: mjx.Model, names: Sequence[str]) -> np.ndarray:
+    # 32 bits in both precisions: JAX caches a 64-bit array in the precision of its first use.
+    return np.array([mjx.name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in names], dtype=np.int32)
 
 
-def _geom_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    return tuple(model.geom(index).name for index in range(model.ngeom))
+def _stance(model: mjx.Model) -> Float[np.ndarray, "25"]:
+    """Return the coordinates (qpos) of the default stance, which are static in a model."""
+    return model.key_qpos[mjx.name2id(model, mujoco.mjtObj.mjOBJ_KEY, "stance")]
 
 
 def _uncommit(tree: Tree) -> Tree:
@@ -125,24 +106,6 @@ def _uncommit(tree: Tree) -> Tree:
     and uncommitted arguments.
     """
     return jax.tree.map(lambda leaf: leaf if isinstance(leaf, Tracer) else jnp.array(np.asarray(leaf)), tree)
-
-
-def stance() -> Float[np.ndarray, "6 3"]:
-    """Return the joint angles [rad] of the default stance (the key frame of the XML).
-
-    >>> stance().shape
-    (6, 3)
-    """
-    return _anatomy().stance[7:].reshape(6, 3)
-
-
-def target_limits() -> Float[np.ndarray, "2 6 3"]:
-    """Return the lowest and the highest set points of the servos [rad], to which `substep` clips them.
-
-    >>> np.rad2deg(target_limits()[:, 0]).round().tolist()  # coxa, femur, tibia
-    [[-75.0, -100.0, -102.0], [75.0, 100.0, 67.0]]
-    """
-    return _anatomy().limits
 
 
 def init(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
@@ -157,12 +120,14 @@ def init(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"]
     # its types.
     with jax.numpy_dtype_promotion("standard"):  # MJX multiplies booleans by floats
         data = _uncommit(mjx.make_data(model))
-    return reset(data, start, angles)
+    return reset(model, data, start, angles)
 
 
-def reset(data: mjx.Data, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None) -> mjx.Data:
+def reset(
+    model: mjx.Model, data: mjx.Data, start: Float[Array, "3"], angles: Float[Array, "6 3"] | None = None
+) -> mjx.Data:
     """Return the state of the same robot at rest at a new start pose; arguments as in `init`."""
-    stance = jnp.asarray(_anatomy().stance, data.qpos.dtype)
+    stance = jnp.asarray(_stance(model), data.qpos.dtype)
     joints = stance[7:] if angles is None else angles.reshape(18).astype(stance.dtype)
     x, y, yaw = start.astype(stance.dtype)
     zero = jnp.zeros_like(yaw)
@@ -208,7 +173,7 @@ def place_barriers(model: mjx.Model, room: arena.Arena, data: mjx.Data) -> mjx.M
     # The rotation by 90 degrees about (-y, x, 0), which rotates the normal of a plane from z to (x, y, 0).
     quaternion = jnp.sqrt(0.5) * jnp.stack([zero + 1, -y, x, zero], axis=1)
     position = jnp.stack([offsets * x, offsets * y, zero], axis=1)
-    ids = _anatomy().barriers
+    ids = _geom_ids(model, BARRIERS)
     return model.replace(
         geom_pos=model.geom_pos.at[ids].set(position.astype(model.geom_pos.dtype)),
         geom_quat=model.geom_quat.at[ids].set(quaternion.astype(model.geom_quat.dtype)),
@@ -256,17 +221,24 @@ def scale_tilt(pose: Pose, factor: Float[Array, ""]) -> Pose:
     return Pose(position=pose.position, quaternion=quaternion)
 
 
-def eye_poses(pose: Pose) -> tuple[Float[Array, "2 3"], Float[Array, "2 3 3"]]:
-    """Return positions [m] and rotation matrices of the left and the right eye (x forward, y left, z up)."""
+def eye_poses(
+    pose: Pose, mounts: tuple[Offset, Offset] | None = None
+) -> tuple[Float[Array, "2 3"], Float[Array, "2 3 3"]]:
+    """Return positions [m] and rotation matrices of the left and the right eye (x forward, y left, z up).
+
+    Args:
+        pose: of the trunk.
+        mounts: where the eyes sit in the trunk's frame [m]; where those of the package's robot do if None.
+    """
     matrix = rotation(pose)
-    offsets = jnp.asarray(_anatomy().eyes, matrix.dtype)
+    offsets = jnp.asarray(sensor_mounts().eyes if mounts is None else mounts, matrix.dtype)
     return pose.position + offsets @ matrix.T, jnp.broadcast_to(matrix, (2, 3, 3))
 
 
-def laser_pose(pose: Pose) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return position [m] and rotation matrix of the laser scanner."""
+def laser_pose(pose: Pose, mount: Offset | None = None) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Return position [m] and rotation matrix of the laser scanner; arguments as those of `eye_poses`."""
     matrix = rotation(pose)
-    return pose.position + matrix @ jnp.asarray(_anatomy().laser, matrix.dtype), matrix
+    return pose.position + matrix @ jnp.asarray(mount or sensor_mounts().laser, matrix.dtype), matrix
 
 
 def joint_angles(data: mjx.Data) -> Float[Array, "6 3"]:
@@ -274,9 +246,9 @@ def joint_angles(data: mjx.Data) -> Float[Array, "6 3"]:
     return data.qpos[7:].reshape(6, 3)
 
 
-def foot_positions(data: mjx.Data) -> Float[Array, "6 3"]:
+def foot_positions(model: mjx.Model, data: mjx.Data) -> Float[Array, "6 3"]:
     """Return the centres of the feet [m, world], at the start of the last substep."""
-    return data.geom_xpos[_anatomy().feet]
+    return data.geom_xpos[_geom_ids(model, FEET)]
 
 
 def capsules(
@@ -287,14 +259,15 @@ def capsules(
     Returns:
         Both ends (13, 3) [m, world] and radii (13,) [m], in the order of `CAPSULES`.
     """
-    ids = _anatomy().capsules
+    ids = _geom_ids(model, CAPSULES)
     along = data.geom_xmat[ids].reshape(-1, 3, 3)[..., 2] * model.geom_size[ids, 1, None]
     return data.geom_xpos[ids] - along, data.geom_xpos[ids] + along, model.geom_size[ids, 0]
 
 
-def is_healthy(data: mjx.Data) -> Bool[Array, ""]:
+def is_healthy(model: mjx.Model, data: mjx.Data) -> Bool[Array, ""]:
     """Return whether the state is finite and the robot is on its feet: not fallen over, on its belly or in the air."""
     is_finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
     is_upright = rotation(pose(data))[2, 2] > MIN_UPRIGHT
-    height = data.qpos[2]
-    return is_finite & is_upright & (height > MIN_TRUNK_HEIGHT) & (height < MAX_TRUNK_HEIGHT)
+    height, standing = data.qpos[2], float(_stance(model)[2])
+    is_up = (height > MIN_TRUNK_HEIGHT * standing) & (height < MAX_TRUNK_HEIGHT * standing)
+    return is_finite & is_upright & is_up

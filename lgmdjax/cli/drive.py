@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 
+from lgmdjax.body import robot_xml
 from lgmdjax.cli.hardware_flags import DriveFlags
 from lgmdjax.deployment import exporter
 from lgmdjax.errors import InputError
@@ -27,6 +28,7 @@ ORDERLY = (Reason.STOPPED, Reason.FINISHED)  # ends with exit code 0; any other 
 def drive(flags: DriveFlags) -> int:
     """Drive a robot until it sits without torque; return the exit code."""
     servo_bus.check_installed()
+    _refuse_other_body(flags.run())
     clock, servos = Clock(flags.speed), joint_map.read(flags.map)
     lenses = tuple(lens.read(path) for path in flags.calibration)
     params = exporter.load(flags.run())
@@ -63,6 +65,15 @@ def drive(flags: DriveFlags) -> int:
             except BusLost as error:
                 raise InputError(f"expected servos that report their positions, got {error}; check cables") from error
             return _run(flags, driver)
+
+
+def _refuse_other_body(run: Path | None) -> None:
+    """Raise `InputError` for a run with a body of its own, since sitting and standing are those of the package's."""
+    if run is not None and robot_xml.read_body(run / "fit-gait") is not None:
+        raise InputError(
+            f"expected a robot with the package's body, got {run} with one of its own, for which no motion to sit and "
+            "to stand is known; drive it by its exported nervous system (`lgmdjax export`)"
+        )
 
 
 def _run(flags: DriveFlags, driver: Driver) -> int:

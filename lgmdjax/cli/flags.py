@@ -49,6 +49,8 @@ class PipelineFlags:
     """seed of all random numbers"""
     name: str = ""
     """name of the run folder; if empty, <scale>-<seed> and each setting that is changed: quick-0_train.epochs=200"""
+    robot: Path | None = None
+    """TOML file that describes a robot of your own (docs/howto/robot.md); the package's robot if left out"""
     track: str = ""
     """log of the curves of fits: tensorboard, or module:function for your own log(step, values)"""
     settings: Annotated[Mapping[str, object], tyro.conf.arg(name="")]
@@ -277,7 +279,8 @@ def parse_pipeline(command: str, description: str, arguments: Sequence[str]) -> 
     for flag, value in changed_settings(preset, settings).items():
         if flag.endswith(".trial"):
             raise InputError(f"expected --{flag} unchanged, got {value}; use the flags of the other trial instead")
-    name = flags.name or name_run(f"{flags.scale}-{flags.seed}", preset, settings)
+    robot = f"_robot={_format(flags.robot.stem)}" if flags.robot else ""
+    name = flags.name or name_run(f"{flags.scale}-{flags.seed}{robot}", preset, settings)
     return replace(flags, name=name, settings=settings)
 
 

@@ -385,8 +385,15 @@ def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequen
     environment.check_jax()
     from lgmdjax.runtime.run_folders import execute, open_run
 
-    run = open_run(given.out, given.name, given.scale, given.seed, given.settings)
+    settings, robot_stages = given.settings, ()
+    if given.robot is not None:
+        from lgmdjax.body import custom_robot
+        from lgmdjax.pipeline import robot
+
+        own = custom_robot.read(given.robot)
+        settings, robot_stages = {"robot": robot.settings_of(own), **settings}, (robot.make_stage(own),)
+    run = open_run(given.out, given.name, given.scale, given.seed, settings)
     from lgmdjax.pipeline.stages import STAGES
 
     with tracking.log_to(given.track, run.folder):
-        return execute(run, STAGES, target)
+        return execute(run, (*robot_stages, *STAGES), target)

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
+from lgmdjax.body import robot_xml
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.datasets import recorded_rooms
 from lgmdjax.datasets.recorded import Recording
 from lgmdjax.detectors import lgmd
@@ -36,6 +38,7 @@ class RecordedCamera:
 
     settings: CameraSettings
     detector: lgmd.Params
+    body: Body | None = None  # on which the camera is; the package's if None
 
 
 def find_camera(recording: Recording) -> RecordedCamera:
@@ -43,13 +46,13 @@ def find_camera(recording: Recording) -> RecordedCamera:
     parameters = recording.parameters
     if "eyes" in parameters and "lgmd" in parameters:
         settings = CameraSettings(**parameters["eyes"])
-        return RecordedCamera(
-            settings=settings, detector=assembly.fit_detector(assembly.lgmd_params(parameters["lgmd"]), settings)
-        )
+        detector = assembly.fit_detector(assembly.lgmd_params(parameters["lgmd"]), settings)
+        return RecordedCamera(settings=settings, detector=detector, body=robot_xml.find_body(recording.folder))
     around = [folder for folder in recording.folder.resolve().parents if (folder / "train").is_dir()]
     runs = [folder for folder in around if (folder / "train" / "controller.safetensors").is_file()]
     robot = assembly.load_robot(runs[0] / "fit-gait", runs[0] / "train") if runs else assembly.load_robot()
-    return RecordedCamera(settings=assembly.camera_settings(robot), detector=robot.controller.detector)
+    camera = assembly.camera_settings(robot)
+    return RecordedCamera(settings=camera, detector=robot.controller.detector, body=robot.body)
 
 
 def find_rooms(recording: Recording) -> list[Arena]:
@@ -63,7 +66,7 @@ def find_rooms(recording: Recording) -> list[Arena]:
 
 def render(eyes: RecordedCamera, room: Arena, walk: Walk) -> Iterator[Pictures]:
     """Yield the pictures of a walk, some seconds at a time; raise `InputError` if they do not give the recorded u."""
-    whole = replace(assembly.camera_params(eyes.settings), overlap=1.0, ground=0.0)
+    whole = replace(assembly.camera_params(eyes.settings, eyes.body), overlap=1.0, ground=0.0)
     rooms = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], room)
     for first in range(0, len(walk), CHECKED_FRAMES):
         part = walk[first : first + CHECKED_FRAMES]

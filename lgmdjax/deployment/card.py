@@ -85,7 +85,7 @@ def _eyes(params: Params) -> JsonObject:
         "rows_seen": hemifield.row_count(camera.height, camera.ground),
         "columns_seen": hemifield.column_count(camera.width, camera.overlap),
         "seen": "the first rows; the first columns of the left picture, the last of the right one",
-        "positions": _rounded(hexapod.eye_poses(level)[0]),  # m, in the trunk's frame
+        "positions": _rounded(hexapod.eye_poses(level, camera.mounts)[0]),  # m, in the trunk's frame
         "frame": "m, trunk: x forward, y left, z up; eyes look forward",
     }
 

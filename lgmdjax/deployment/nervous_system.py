@@ -78,7 +78,7 @@ def from_robot(robot: closed_loop.Params) -> Params:
     learned = robot.controller.policy.policies[policies.POLICIES.index(POLICY)]
     params = Params(
         controller=replace(robot.controller, policy=learned),
-        limits=jnp.asarray(hexapod.target_limits()),
+        limits=jnp.asarray(hexapod.target_limits(robot.body)),
         camera=robot.camera,
     )
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params)

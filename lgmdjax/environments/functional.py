@@ -175,7 +175,7 @@ class Environment:
             targets = action.reshape(6, 3)
         before = replace(state.robot, controller=replace(state.robot.controller, velocity=velocity))
         after, clearance = closed_loop.move(self.params, self.model, self._scene(state), before, targets)
-        after = closed_loop.freeze_unhealthy(before, after)
+        after = closed_loop.freeze_unhealthy(self.model, before, after)
         pose = hexapod.pose(after.data)
         floor, (new_cells, new_floor) = coverage.step(state.floor, pose.position[:2])
         outcome = Outcome(
@@ -243,7 +243,8 @@ def make(
     blind = BlindParams(velocity=jnp.zeros(2))  # the action takes the place of the policy
     params = replace(params, controller=replace(params.controller, policy=blind))
     frames = jnp.asarray(round(seconds * FRAME_RATE), jnp.int32)
-    return Environment(params=params, model=hexapod.build(), rooms=_make_rooms(room), frames=frames, settings=settings)
+    model = closed_loop.build_model(params)
+    return Environment(params=params, model=model, rooms=_make_rooms(room), frames=frames, settings=settings)
 
 
 def _make_rooms(room: RoomName | Room) -> Room:

@@ -69,7 +69,7 @@ def action_space(environment: Environment) -> spaces.Box:
     if environment.settings.action == "velocity":
         gait = policies.GAIT_RANGE
         return spaces.Box(float(gait.min_velocity), float(gait.max_velocity), (2,), np.float32)  # nominal, 0.05 m/s
-    low, high = hexapod.target_limits().reshape(2, 18).astype(np.float32)
+    low, high = hexapod.target_limits(environment.params.body).reshape(2, 18).astype(np.float32)
     return spaces.Box(low, high, dtype=np.float32)  # rad
 
 

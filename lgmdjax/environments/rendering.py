@@ -28,7 +28,7 @@ def render(environment: Environment, state: State) -> UInt8[np.ndarray, "height 
         state: of one robot.
     """
     qpos = np.asarray(state.robot.data.qpos, float)
-    body = walk_video.body_geometry(qpos[None])
+    body = walk_video.body_geometry(qpos[None], environment.params.body)
     heading = geometry.yaw(qpos[3:7])
     forward = np.array([np.cos(heading), np.sin(heading), 0.0])
     target = qpos[:3]

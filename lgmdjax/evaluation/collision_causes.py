@@ -40,6 +40,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy import ndimage
 
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.control import braitenberg
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import contacts, metrics
@@ -134,13 +135,16 @@ class _Place(NamedTuple):
     in_corner: bool
 
 
-def classify(record: Record, arenas: arena.Arena, baseline: QuietBaseline | None = None) -> list[Collision]:
+def classify(
+    record: Record, arenas: arena.Arena, baseline: QuietBaseline | None = None, body: Body | None = None
+) -> list[Collision]:
     """Describe every collision of recorded walks, in the order of robots and frames; each has its `cause`.
 
     Args:
         record: walks, axes (robot, frame).
         arenas: the robots' rooms, with a leading axis of robots.
         baseline: fitted to other walks of the same robot; by default fitted to these walks (`fit_baseline`).
+        body: of the robot; the package's if None.
     """
     found = np.argwhere(np.asarray(record.contact) & np.asarray(record.ok))
     if not len(found):
@@ -158,7 +162,7 @@ def classify(record: Record, arenas: arena.Arena, baseline: QuietBaseline | None
             Collision(
                 robot=robot,
                 frame=frame,
-                **_locate(_index(record, window), _index(arenas, robot))._asdict(),
+                **_locate(_index(record, window), _index(arenas, robot), body)._asdict(),
                 u_rise=float(rise[window].max()),
                 u_difference=float(difference[window].max()),
                 command_turn=float(command_turn[window].mean()),
@@ -235,10 +239,10 @@ def _index(batch: _Tree, index: int | tuple[int, slice]) -> _Tree:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[index], batch)
 
 
-def _locate(walk: Record, room: arena.Arena) -> _Place:
+def _locate(walk: Record, room: arena.Arena, body: Body | None) -> _Place:
     """Locate the contact in the last frame of a walk, and check whether the robot was in a corner."""
     surfaces = [contacts.touchable_surfaces(room, float(time)) for time in walk.time]
-    contact = contacts.locate_contact(walk, surfaces[-1])
+    contact = contacts.locate_contact(walk, surfaces[-1], body)
     centres = np.asarray(walk.position, float)[:, None, :2]
     points = np.concatenate([contacts.nearest_points(*pair) for pair in zip(surfaces, centres, strict=True)])
     return _Place(

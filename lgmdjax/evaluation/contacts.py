@@ -26,7 +26,8 @@ from jaxtyping import Array, Float
 from numpy import ndarray
 
 from lgmdjax import geometry
-from lgmdjax.body import hexapod
+from lgmdjax.body import robot_xml
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.simulation.closed_loop import SUBSTEPS, Record
 from lgmdjax.world import arena, obstacles
 
@@ -45,7 +46,7 @@ class Surfaces:
 class Contact(NamedTuple):
     """A contact: limb, point on the robot and surface."""
 
-    limb: str  # a name of `hexapod.CAPSULES`
+    limb: str  # a name of `robot_xml.CAPSULES`
     point: Float[ndarray, "2"]  # m, on the robot, seen from above
     surface: int  # index in the order of `nearest_points`
 
@@ -95,10 +96,10 @@ def nearest_points(surfaces: Surfaces, points: Float[ndarray, "n 2"]) -> Float[n
     return np.concatenate([on_boxes, on_cylinders], axis=1)
 
 
-def locate_contact(walk: Record, surfaces: Surfaces) -> Contact:
+def locate_contact(walk: Record, surfaces: Surfaces, body: Body | None = None) -> Contact:
     """Locate the contact in the last frame of a walk of one robot without resets; axis (frame,)."""
     poses = extrapolate_substeps(walk)
-    starts, ends, radii = collision_capsules(poses)
+    starts, ends, radii = collision_capsules(poses, body)
     fraction = np.linspace(0.0, 1.0, AXIS_SAMPLES)[:, None]
     axes = starts[..., None, :] + fraction * (ends - starts)[..., None, :]
     offset = nearest_points(surfaces, axes.reshape(-1, 2)).reshape(*axes.shape[:-1], -1, 2) - axes[..., None, :]
@@ -107,7 +108,7 @@ def locate_contact(walk: Record, surfaces: Surfaces) -> Contact:
     substep, limb, _, surface = map(int, nearest)
     point = axes[nearest[:-1]] + radii[limb] * offset[nearest] / max(distance[nearest], 1e-9)
     position, quaternion = poses[[substep], :3], poses[[substep], 3:7]
-    return Contact(hexapod.CAPSULES[limb], to_body_frame(position, quaternion, point[None])[0], surface)
+    return Contact(robot_xml.CAPSULES[limb], to_body_frame(position, quaternion, point[None])[0], surface)
 
 
 def extrapolate_substeps(walk: Record) -> Float[ndarray, "substeps 25"]:
@@ -122,12 +123,12 @@ def extrapolate_substeps(walk: Record) -> Float[ndarray, "substeps 25"]:
 
 
 def collision_capsules(
-    poses: Float[ndarray, "n 25"],
+    poses: Float[ndarray, "n 25"], body: Body | None = None
 ) -> tuple[Float[ndarray, "n capsules 2"], Float[ndarray, "n capsules 2"], Float[ndarray, " capsules"]]:
     """Compute both ends [m, world, from above] and radii [m] of the capsules that collide (`hexapod.CAPSULES`)."""
-    model = hexapod.load()
+    model = robot_xml.compiled(body)
     data = mujoco.MjData(model)
-    ids = [model.geom(name).id for name in hexapod.CAPSULES]
+    ids = [model.geom(name).id for name in robot_xml.CAPSULES]
     ends = []
     for pose in poses:
         data.qpos[:] = pose

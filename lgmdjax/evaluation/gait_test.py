@@ -74,7 +74,7 @@ def _simulate(
 ) -> tuple[hexapod.Pose, Float[Array, "walks steps 6 3"]]:
     def step(_: None, data: mjx.Data, angles: Array) -> tuple[mjx.Data, tuple[hexapod.Pose, Array]]:
         data = hexapod.substep(model, data, angles)
-        return data, (hexapod.pose(data), hexapod.foot_positions(data))
+        return data, (hexapod.pose(data), hexapod.foot_positions(model, data))
 
     starts = jax.vmap(lambda _: hexapod.init(model, jnp.zeros(3)))(targets)
     return rollout.scan_batch(step, None, starts, targets)[1]

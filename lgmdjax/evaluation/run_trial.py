@@ -202,4 +202,4 @@ def _write_results(folder: Path, trial_run: TrialRun, robot: closed_loop.Params,
     (folder / "paths.png").write_bytes(style.to_png(plot_trial(trial, rooms, record)))
     walk_video.write_video(folder / "walk.mp4", record, rooms, robot, seconds=VIDEO_SECONDS)
     if walk_page.HAS_VISER:
-        walk_page.walk_page(record, rooms, seconds=VIDEO_SECONDS).write(folder / "walk.html")
+        walk_page.walk_page(record, rooms, seconds=VIDEO_SECONDS, body=robot.body).write(folder / "walk.html")

@@ -8,7 +8,6 @@ Source: Cizek & Faigl, sec. 3.2, which gives no loss and no settings; these are 
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -125,8 +124,7 @@ def fit(
     demonstrations = _demonstrations(geometry, gait or Gait(), cpg_params or cpg.Params(), printed_input)
     keys = jax.random.split(jax.random.key(0) if key is None else key, (candidates, 3))
     networks = _initial_networks(demonstrations.inputs, demonstrations.targets, keys)
-    left = replace(geometry, mounts=geometry.mounts[:3], mount_yaws=geometry.mount_yaws[:3])
-    problem = _Problem(left, demonstrations)
+    problem = _Problem(kinematics.left_legs(geometry), demonstrations)
     search_steps = steps // 8
     networks = _minimise(_candidates_loss, networks, problem, 0.01, range(search_steps), report=report)
     networks = _best_candidates(networks, problem)

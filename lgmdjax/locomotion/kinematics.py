@@ -6,8 +6,11 @@
 | -      | feet    | m    | centres of the feet in the trunk's frame  |
 
 Joint zeros: leg straight out along its mount, femur horizontal, tibia vertical. A positive coxa angle turns the leg to
-the left, positive femur and tibia angles lift it. The numbers are read from the robot's model.
+the left, positive femur and tibia angles lift it. The numbers are read from the robot's model. Lengths may differ from
+leg to leg, stiffness and lag from joint to joint.
 """
+
+from dataclasses import replace
 
 import jax.numpy as jnp
 import mujoco
@@ -24,13 +27,13 @@ class LegGeometry:
 
     mounts: Float[Array, "legs 3"]  # m, coxa axes in the trunk's frame
     mount_yaws: Float[Array, "legs"]  # rad
-    coxa: Scalar  # m, length
-    femur: Scalar  # m, length
-    tibia: Scalar  # m, length to the foot's centre
+    coxa: Scalar | Float[Array, "legs"]  # m, length
+    femur: Scalar | Float[Array, "legs"]  # m, length
+    tibia: Scalar | Float[Array, "legs"]  # m, length to the foot's centre
     foot_radius: Scalar  # m
     weight: Scalar  # N, of the robot
-    stiffness: Scalar  # N m/rad, of a servo
-    lag: Scalar  # s, delay of a servo behind a steady motion
+    stiffness: Scalar | Float[Array, "3"]  # N m/rad, of the servos of a leg
+    lag: Scalar | Float[Array, "3"]  # s, delay of a servo behind a steady motion
 
 
 def read_geometry(model: mujoco.MjModel) -> LegGeometry:
@@ -42,18 +45,30 @@ def read_geometry(model: mujoco.MjModel) -> LegGeometry:
         np.flatnonzero((model.geom_bodyid == tibia) & (model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE))[0]
         for tibia in bodies[:, 2]
     ]
-    stiffness = float(model.actuator_gainprm[0, 0])
+    gain, damping = model.actuator_gainprm[:, 0].reshape(6, 3)[0], -model.actuator_biasprm[:, 2].reshape(6, 3)[0]
     return LegGeometry(
         mounts=jnp.asarray(model.body_pos[bodies[:, 0]], dtype=float),
         mount_yaws=jnp.asarray(2 * np.arctan2(z, w), dtype=float),
-        coxa=float(model.body_pos[bodies[0, 1], 0]),
-        femur=float(model.body_pos[bodies[0, 2], 0]),
-        tibia=-float(model.geom_pos[feet[0], 2]),
+        coxa=_common(model.body_pos[bodies[:, 1], 0]),
+        femur=_common(model.body_pos[bodies[:, 2], 0]),
+        tibia=_common(-model.geom_pos[feet, 2]),
         foot_radius=float(model.geom_size[feet[0], 0]),
         weight=float(model.body_mass.sum() * -model.opt.gravity[2]),
-        stiffness=stiffness,
-        lag=float(-model.actuator_biasprm[0, 2]) / stiffness,
+        stiffness=_common(gain),
+        lag=_common(damping / gain),
     )
+
+
+def left_legs(geometry: LegGeometry) -> LegGeometry:
+    """Return the geometry of the left legs alone."""
+    names = ("mounts", "mount_yaws", "coxa", "femur", "tibia")
+    values = {name: getattr(geometry, name) for name in names}
+    return replace(geometry, **{name: value[:3] for name, value in values.items() if np.ndim(value)})
+
+
+def _common(values: Float[np.ndarray, " n"]) -> Float[Array, " n"] | float:
+    """Return the number that some values have in common; all of them as an array if they differ."""
+    return float(values[0]) if np.all(values == values[0]) else jnp.asarray(values, dtype=float)
 
 
 def forward(geometry: LegGeometry, angles: Float[Array, "*batch legs 3"]) -> Float[Array, "*batch legs 3"]:

@@ -18,12 +18,16 @@ formula.
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
 from lgmdjax.locomotion import cpg, kinematics
 from lgmdjax.locomotion.kinematics import LegGeometry, Scalar
+
+NUMERIC = "gait"
+"""Name of the custom numbers of a model: body height, swing height, x and y of the left feet [m]."""
 
 
 @struct.dataclass(kw_only=True)
@@ -45,9 +49,29 @@ class Gait:
     duty_factor: Scalar = 0.55  # fraction of the cycle in stance; the tripods overlap by the excess over 0.5
     swing_height: Scalar = 0.02  # m
     body_height: Scalar = 0.10  # m, of the trunk's centre above the feet's centres
-    front_foot: tuple[float, float] = struct.field(pytree_node=False, default=(0.155, 0.145))  # m, left, neutral x, y
-    middle_foot: float = struct.field(pytree_node=False, default=0.20)  # m, left, neutral y
+    left_feet: tuple[tuple[float, float], ...] = struct.field(
+        pytree_node=False, default=((0.155, 0.145), (0.0, 0.20), (-0.155, 0.145))
+    )  # m, neutral x, y: front, middle, rear
     stride_gain: Scalar = 1.02  # compensates for slip
+
+    def width_ratio(self) -> float:
+        """Return the width of the stance as a multiple of that of the package's robot."""
+        return max(y for _, y in self.left_feet) / max(y for _, y in Gait.left_feet)
+
+
+def read_gait(model: mujoco.MjModel) -> Gait:
+    """Return the gait of a robot's model: its custom numbers `NUMERIC`; without them that of the package's robot."""
+    if not any(model.numeric(index).name == NUMERIC for index in range(model.nnumeric)):
+        return Gait()
+    body_height, swing_height, *feet = model.numeric(NUMERIC).data.tolist()
+    return Gait(
+        body_height=body_height, swing_height=swing_height, left_feet=tuple(zip(feet[::2], feet[1::2], strict=True))
+    )
+
+
+def to_numbers(gait: Gait) -> list[float]:
+    """Return the numbers of a gait that differ between bodies, as `read_gait` expects them in a model."""
+    return [float(gait.body_height), float(gait.swing_height), *(value for foot in gait.left_feet for value in foot)]
 
 
 def neutral_feet(gait: Gait) -> Float[Array, "6 3"]:
@@ -134,8 +158,8 @@ def joint_targets(
 
 def _neutral_plan(gait: Gait) -> Float[np.ndarray, "6 2"]:
     """Return the neutral positions of the feet in plan view [m]."""
-    x, y = gait.front_foot
-    return np.array([(x, y), (0, gait.middle_foot), (-x, y), (-x, -y), (0, -gait.middle_foot), (x, -y)], float)
+    left = np.array(gait.left_feet, float)
+    return np.concatenate([left, left[::-1] * [1.0, -1.0]])
 
 
 def _smooth_step(x: Float[Array, "*n"]) -> Float[Array, "*n"]:

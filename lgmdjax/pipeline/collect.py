@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lgmdjax.body import hexapod
 from lgmdjax.control import braitenberg, policies
 from lgmdjax.detectors import lgmd
 from lgmdjax.learning import lgmd_grid_search
@@ -29,7 +28,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, see
         write_json(folder / "calibration.json", _calibrate(gait, settings, seed))
     detector = load_detector(folder)
     params = _teacher_robot(gait, settings, detector)
-    model = hexapod.build()
+    model = closed_loop.build_model(params)
     writer = episodes.Writer(folder / "episodes", _parameters(settings, detector))
     for episode in range(writer.chunks, settings.episodes):
         label = f"collect: episode {episode + 1} of {settings.episodes}"
@@ -44,13 +43,14 @@ def _calibrate(gait: Path, settings: CollectSettings, seed: int) -> JsonObject:
     """Record walks of the teacher without rendering, render them for all candidates, and select the thresholds."""
     detector = assembly.fit_detector(lgmd.Params(), settings.eyes)
     params = assembly.with_teacher(_teacher_robot(gait, settings, detector), lgmd_grid_search.CALIBRATION_RULE)
-    rooms, seconds = (
+    rooms, model = (
         room_batches.training_rooms(seed, CALIBRATION_EPISODE, settings.robots),
-        settings.calibration_seconds,
+        closed_loop.build_model(params),
     )
-    chunks = recording.rollout_with_progress(params, hexapod.build(), rooms, seconds, "calibrate", render=False)
+    seconds = settings.calibration_seconds
+    chunks = recording.rollout_with_progress(params, model, rooms, seconds, "calibrate", render=False)
     record = rollout.concatenate_time(list(chunks))
-    candidates, camera_params = lgmd_grid_search.candidate_grid(), assembly.camera_params(settings.eyes)
+    candidates, camera_params = lgmd_grid_search.candidate_grid(), params.camera
     print("calibrate: rendering the walks for all candidates of T_s and W_I", flush=True)
     u, feed_forward = lgmd_grid_search.evaluate(detector, camera_params, rooms.arena, record, candidates)
     selection = lgmd_grid_search.select(record, np.asarray(u), np.asarray(feed_forward), candidates)

@@ -18,6 +18,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.control.names import PolicyName
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
@@ -53,13 +54,13 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: EvaluateSettings, se
             rooms = trials.sample_rooms(trial.name, plan.seeds, seed)
             figure = run_trial.plot_trial(trial, rooms, records[trial.name]["learned"])
             (folder / f"{trial.name}.svg").write_bytes(style.to_svg(figure))
-    write_json(folder / "kinds.json", _collision_causes(settings, records, seed))
+    write_json(folder / "kinds.json", _collision_causes(settings, records, seed, robot.body))
     continuing = {trial: some for trial, some in records.items() if not trials.TRIALS[trial].ends_at_contact}
     write_arrays(folder / "trajectories.npz", _trajectories(continuing))
     shown = _one(records["testing"]["learned"], selection.select_walk(records["testing"]["learned"]))
     write_arrays(folder / "walk.npz", {name: getattr(shown, name) for name in episodes.FIELDS})
     resolution = next(plan.eyes for plan in settings.trials if plan.trial == "testing")
-    write_arrays(folder / "layers.npz", _layers(robot.controller.detector, resolution, shown))
+    write_arrays(folder / "layers.npz", _layers(robot, resolution, shown))
 
 
 def _record(
@@ -73,7 +74,9 @@ def _record(
     return run_trial.record_trial(folder / plan.trial / policy, trial_run, robot, seed)[1]
 
 
-def _collision_causes(settings: EvaluateSettings, records: Records, seed: int) -> dict[str, dict[str, int]]:
+def _collision_causes(
+    settings: EvaluateSettings, records: Records, seed: int, body: Body | None
+) -> dict[str, dict[str, int]]:
     """Count the causes of the learned policy's collisions in each trial; empty if it walked too little for that.
 
     The baseline of u is that of the held-out rooms for every camera, since cells of the same size respond alike.
@@ -86,7 +89,7 @@ def _collision_causes(settings: EvaluateSettings, records: Records, seed: int) -
     for plan in settings.trials:
         trial, record = trials.TRIALS[plan.trial], records[plan.trial]["learned"]
         rooms = trials.sample_rooms(trial.name, plan.seeds, seed)
-        collisions = collision_causes.classify(record, rooms.arena, baseline)
+        collisions = collision_causes.classify(record, rooms.arena, baseline, body)
         if trial.ends_at_contact:
             ends = trials.find_outcome(trial, record).frames
             collisions = [collision for collision in collisions if collision.frame < ends[collision.robot]]
@@ -108,13 +111,15 @@ def _one(record: closed_loop.Record, robot: int) -> closed_loop.Record:
     return jax.tree.map(lambda leaf: leaf[robot], record)
 
 
-def _layers(detector: lgmd.Params, resolution: Resolution, walk: closed_loop.Record) -> dict[str, np.ndarray]:
+def _layers(robot: closed_loop.Params, resolution: Resolution, walk: closed_loop.Record) -> dict[str, np.ndarray]:
     """Render the frame that excited the left detector most; return its picture and layers (fig. 6b).
 
     The whole picture is rendered, at the paper's resolution.
     """
-    fine = camera.Params()
-    detector = dataclasses.replace(detector, pooling=max(resolution.pooling * fine.width // resolution.width, 1))
+    fine = camera.Params(mounts=robot.camera.mounts)
+    detector = dataclasses.replace(
+        robot.controller.detector, pooling=max(resolution.pooling * fine.width // resolution.width, 1)
+    )
     steady = np.where(np.asarray(walk.resets) == walk.resets[-1], walk.excitation[:, 0], 0.0)
     last = max(int(np.argmax(steady)), 2)
     frames = jax.tree.map(lambda leaf: np.asarray(leaf)[None, last - 2 : last + 1], walk)

@@ -1,6 +1,7 @@
 """Stage fit-gait: fit the shaping networks to the tripod gait, and simulate walks on an empty floor.
 
-Writes shaping.safetensors, gait.json (speeds, turning, sway), cpg.npz (fig. 5b) and foot.npz (fig. 5c).
+Writes shaping.safetensors, gait.json (speeds, turning, sway), cpg.npz (fig. 5b) and foot.npz (fig. 5c); also robot.xml
+if the robot has a body of its own.
 """
 
 import math
@@ -15,12 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
-from lgmdjax.body import hexapod
+from lgmdjax.body import hexapod, robot_xml
 from lgmdjax.evaluation import gait_test
 from lgmdjax.evaluation.gait_test import GaitTrajectory
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
 from lgmdjax.pipeline.settings import FitGaitSettings
-from lgmdjax.runtime.storage import JsonObject, write_arrays, write_json
+from lgmdjax.runtime import partial_files
+from lgmdjax.runtime.storage import JsonObject, read_file, write_arrays, write_json
 
 SWEEP_COMMANDS = (
     (1.0, 1.0),
@@ -54,7 +56,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: FitGaitSettings, see
     """
     cpg_params = cpg.Params()
     gait_test.require_duration(settings.seconds, float(cpg_params.cycle_time))
-    body = hexapod.load()
+    body = hexapod.load(_take_body(folder, inputs))
     networks = {printed: _fit(body, settings, seed, printed) for printed in (False, True)}
     shaping.save(folder / "shaping.safetensors", networks[False], {"steps": settings.steps, "seed": seed})
     write_arrays(folder / "cpg.npz", _onset(cpg_params, seed))
@@ -75,6 +77,16 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: FitGaitSettings, see
     write_arrays(folder / "foot.npz", _foot_paths(body, targets, walks, float(cpg_params.cycle_time)))
 
 
+def _take_body(folder: Path, inputs: Mapping[str, Path]) -> robot_xml.Body | None:
+    """Return the body of stage robot, and write it beside the gait, where all later stages find it; None without it."""
+    if "robot" not in inputs:
+        return None
+    body = robot_xml.Body(read_file(inputs["robot"] / robot_xml.FILE).decode())
+    with partial_files.replacing(folder / robot_xml.FILE) as partial:
+        partial.write_text(body.xml, encoding="utf-8")
+    return body
+
+
 def _fit(body: mujoco.MjModel, settings: FitGaitSettings, seed: int, printed_input: bool) -> shaping.Params:
     name = "the paper's input" if printed_input else "the corrected input"
     with tqdm(total=settings.steps, desc=f"fit-gait: {name}", unit="step") as bar:
@@ -83,8 +95,14 @@ def _fit(body: mujoco.MjModel, settings: FitGaitSettings, seed: int, printed_inp
             bar.set_postfix_str(f"{math.sqrt(max(loss, 0)):.2f} mm", refresh=False)
             bar.update(done - bar.n)
 
-        geometry, key = kinematics.read_geometry(body), jax.random.key(seed)
-        return gait_fit.fit(geometry, key=key, steps=settings.steps, printed_input=printed_input, progress=show)
+        return gait_fit.fit(
+            kinematics.read_geometry(body),
+            tripod_gait.read_gait(body),
+            key=jax.random.key(seed),
+            steps=settings.steps,
+            printed_input=printed_input,
+            progress=show,
+        )
 
 
 def _onset(network: cpg.Params, seed: int, cycles: int = 12) -> dict[str, np.ndarray | float]:

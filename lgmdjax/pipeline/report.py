@@ -22,7 +22,8 @@ from pathlib import Path
 import jinja2
 import numpy as np
 
-from lgmdjax.body import hexapod
+from lgmdjax.body import robot_xml
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import collision_causes, trials
 from lgmdjax.paths import PACKAGE_DIR
@@ -51,7 +52,8 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: ReportSettings, seed
     """Write index.html from the folders of all earlier stages, and walk.html if the extra `viewer` is installed."""
     if walk_page.HAS_VISER:
         walk = Record(**read_arrays(folder.parent / "evaluate/walk.npz"))
-        walk_page.walk_page(walk, scenes.testing_room(), seconds=WALK_SECONDS).write(folder / WALK_PAGE)
+        body, room = robot_xml.read_body(inputs["fit-gait"]), scenes.testing_room()
+        walk_page.walk_page(walk, room, seconds=WALK_SECONDS, body=body).write(folder / WALK_PAGE)
     render(folder.parent, folder, video_seconds=settings.video_seconds)
 
 
@@ -95,8 +97,9 @@ def render(
 def _contents(run_folder: Path, room: arena.Arena, video_seconds: float) -> JsonObject:
     """Return all variables of the template."""
     results = report_data.read_results(run_folder)
+    body = robot_xml.read_body(run_folder / "fit-gait")
     onset, layers = read_arrays(run_folder / "fit-gait/cpg.npz"), read_arrays(run_folder / "evaluate/layers.npz")
-    camera_params = report_data.testing_camera(results)
+    camera_params = report_data.testing_camera(results, body)
     return {
         **results._asdict(),
         "figures": _figures(run_folder, results, onset, room),
@@ -111,6 +114,7 @@ def _contents(run_folder: Path, room: arena.Arena, video_seconds: float) -> Json
         "versions": report_data.versions(results.stages),
         **_study_contents(results.studies),
         **_names(),
+        "robot_size": _robot_size(body),
     }
 
 
@@ -140,7 +144,7 @@ def _study_contents(studies: Mapping[str, Sequence[JsonObject]]) -> JsonObject:
 
 
 def _names() -> JsonObject:
-    """Return what the page says in every run: titles, meanings, and the size of the robot."""
+    """Return what the page says in every run: titles and meanings."""
     return {
         "titles": TITLES,
         "trials": trials.TRIALS,
@@ -148,13 +152,13 @@ def _names() -> JsonObject:
         "variants": VARIANTS,
         "cause_meanings": collision_causes.CAUSES,
         "nominal": NOMINAL_SPEED,
-        "robot_size": _robot_size(),
     }
 
 
-def _robot_size() -> dict[str, float]:
+def _robot_size(body: Body | None) -> dict[str, float]:
     """Measure length and width of the standing robot's visible parts [m]."""
-    starts, ends, _, _, radii, _ = walk_video.body_geometry(hexapod.load().key("stance").qpos[None])
+    stance = robot_xml.compiled(body).key("stance").qpos
+    starts, ends, _, _, radii, _ = walk_video.body_geometry(stance[None], body)
     tips, thick = np.stack([starts[0], ends[0]]), radii[:, None]
     length, width, _ = np.max(tips + thick, axis=(0, 1)) - np.min(tips - thick, axis=(0, 1))
     return {"length": float(length), "width": float(width)}

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lgmdjax.body import robot_xml
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.pipeline.report_figures import TITLES
 from lgmdjax.runtime.run_folders import read_facts
 from lgmdjax.runtime.storage import JsonObject, read_json, read_table
@@ -85,11 +87,12 @@ def _with_present_names(content: Any) -> Any:
     return content
 
 
-def testing_camera(results: Results) -> camera.Params:
+def testing_camera(results: Results, body: Body | None = None) -> camera.Params:
     """Return the camera of the learned policy in the testing room: the trial's resolution, the detectors' field."""
+    mounts = None if body is None else robot_xml.sensor_mounts(body).eyes
     size = next(plan["eyes"] for plan in results.settings["evaluate"]["trials"] if plan["trial"] == "testing")
     field = {name: results.calibration[name] for name in ("overlap", "ground") if name in results.calibration}
-    return camera.Params(width=size["width"], height=size["height"], **field)
+    return camera.Params(width=size["width"], height=size["height"], mounts=mounts, **field)
 
 
 def coarse_pictures(settings: JsonObject) -> dict[str, str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from lgmdjax.body import robot_xml
 from lgmdjax.evaluation import trials
 from lgmdjax.locomotion.tripod_gait import Gait
 from lgmdjax.reporting import walk_video
@@ -86,6 +87,6 @@ def render_video(run_folder: Path, camera_params: camera.Params, room: arena.Are
     """Render the video of the learned policy's walk, and return it as MP4."""
     recorded = read_arrays(run_folder / "evaluate/walk.npz")
     trace = walk_video.WalkTrace(*(recorded[name] for name in walk_video.WalkTrace._fields))
-    buffer = io.BytesIO()
-    walk_video.write_trace(buffer, trace, room, camera_params, seconds)
+    buffer, body = io.BytesIO(), robot_xml.read_body(run_folder / "fit-gait")
+    walk_video.write_trace(buffer, trace, room, camera_params, seconds, body=body)
     return buffer.getvalue()

@@ -7,6 +7,14 @@ from lgmdjax.sensors.settings import CameraSettings
 
 
 @dataclass(frozen=True, kw_only=True)
+class RobotSettings:
+    """A robot of one's own."""
+
+    name: str  # that of its TOML file
+    digest: str  # of the TOML file and the MJCF
+
+
+@dataclass(frozen=True, kw_only=True)
 class FitGaitSettings:
     """Fit of the shaping networks to the regular tripod gait, and walks at set velocities."""
 

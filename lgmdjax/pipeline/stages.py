@@ -20,7 +20,7 @@ STUDIES = (
     Stage(name="sensitivity", run=sensitivity.run, inputs=_ROBOT),
 )
 STAGES = (
-    Stage(name="fit-gait", run=fit_gait.run),
+    Stage(name="fit-gait", run=fit_gait.run, inputs=("robot",)),  # of `lgmdjax.pipeline.robot`, if there is one
     Stage(name="collect", run=collect.run, inputs=("fit-gait",)),
     Stage(name="train", run=train.run, inputs=("fit-gait", "collect")),
     Stage(name="evaluate", run=evaluate.run, inputs=_ROBOT),

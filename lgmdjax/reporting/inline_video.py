@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lgmdjax.reporting import walk_video
-from lgmdjax.simulation import closed_loop
+from lgmdjax.simulation import assembly, closed_loop
 from lgmdjax.simulation.closed_loop import Record, Room
 from lgmdjax.world import arena
 
@@ -51,6 +51,6 @@ def show_walk(
     lj.show_walk(record, rooms)
     ```
     """
-    content = io.BytesIO()
-    walk_video.write_trace(content, *walk_video.choose_trace(record, room, robot, index), seconds)
+    content, robot = io.BytesIO(), robot or assembly.load_robot()
+    walk_video.write_trace(content, *walk_video.choose_trace(record, room, robot, index), seconds, body=robot.body)
     return InlineVideo(content.getvalue())

@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import selection, walk_scene
 from lgmdjax.reporting.playback import FRAME_RATE, Playback
@@ -45,7 +46,13 @@ class WalkPage:
 
 
 def walk_page(
-    record: Record, room: Room | Arena, *, index: int | None = None, seconds: float = 15.0, follow: bool = False
+    record: Record,
+    room: Room | Arena,
+    *,
+    index: int | None = None,
+    seconds: float = 15.0,
+    follow: bool = False,
+    body: Body | None = None,
 ) -> WalkPage:
     """Return a page about one walk of a record, of the part that `selection.select_segment` selects.
 
@@ -57,6 +64,7 @@ def walk_page(
         index: number of the robot to show; by default that of `selection.select_walk`.
         seconds: duration of the part, `MAX_SECONDS` at most.
         follow: keep the robot in the middle; otherwise the page shows the whole room.
+        body: of the robot that walked, `robot.body`; the package's if None.
 
     ```python
     import jax
@@ -72,7 +80,7 @@ def walk_page(
         raise InputError(f"expected seconds above 0 and up to {MAX_SECONDS:g}, got {seconds}; choose another duration")
     frames = selection.select_segment(np.asarray(walk.position), np.asarray(walk.velocity), round(seconds * FRAME_RATE))
     part = jax.tree.map(lambda leaf: leaf[frames], walk)
-    return page_of(to_playback(part, scene), follow=follow)
+    return page_of(to_playback(part, scene), follow=follow, body=body)
 
 
 def to_playback(walk: Record, room: Arena) -> Playback:
@@ -91,13 +99,13 @@ def to_playback(walk: Record, room: Arena) -> Playback:
     )
 
 
-def page_of(playback: Playback, *, follow: bool = False) -> WalkPage:
+def page_of(playback: Playback, *, follow: bool = False, body: Body | None = None) -> WalkPage:
     """Return a page about a whole walk."""
     if not np.all(np.isfinite(playback.qpos)):
         raise InputError("expected a walk with finite poses, got one without; choose another walk")
     server = walk_scene.quiet_server("127.0.0.1", 0)  # viser has no scene without a server
     try:
-        scene = WalkScene(server)
+        scene = WalkScene(server, body)
         scene.follows = follow
         scene.set_room(playback.room, playback.centres_at(0))
         scene.trace(playback)

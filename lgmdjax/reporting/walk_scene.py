@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from lgmdjax.body import robot_xml
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.errors import InputError
 from lgmdjax.reporting.playback import Playback, RoomShape, contacts_of, path_of
 
@@ -64,18 +65,27 @@ def _light(server: "viser.ViserServer") -> None:
 class WalkScene:
     """A scene with one room and one robot."""
 
-    def __init__(self, server: "viser.ViserServer"):
+    def __init__(self, server: "viser.ViserServer", body: Body | None = None):
         self.server = server
-        self.model = robot_xml.load()
-        self.data = mujoco.MjData(self.model)
         self.follows = True
         self.on_move: Callable[[int, float, float], None] | None = None  # (dragged obstacle, x, y [m])
-        self._robot = mjviser.ViserMujocoScene(server, self.model, num_envs=1)
+        self._build(body)
+
+    def set_body(self, body: Body | None) -> None:
+        """Draw a robot with another body from now on; the room has to be set again."""
+        if body != self.body:
+            self.server.scene.reset()
+            self._build(body)
+
+    def _build(self, body: Body | None) -> None:
+        self.body, self.model = body, robot_xml.compiled(body)
+        self.data = mujoco.MjData(self.model)
+        self._robot = mjviser.ViserMujocoScene(self.server, self.model, num_envs=1)
         self._robot.camera_tracking_enabled = False
         self._robot.geom_groups_visible[0] = False  # the floor and the barriers of the physics
         self._robot._sync_visibilities()
-        self._world = server.scene.add_frame(WORLD, show_axes=False)
-        _light(server)
+        self._world = self.server.scene.add_frame(WORLD, show_axes=False)
+        _light(self.server)
         self._obstacles: dict[int, viser.MeshHandle] = {}
         self._heights: dict[int, float] = {}
         self._centres: Float[ndarray, "n 2"] = np.zeros((0, 2))

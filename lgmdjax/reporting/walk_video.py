@@ -29,7 +29,8 @@ from PIL import Image
 from scipy import ndimage
 
 from lgmdjax import geometry
-from lgmdjax.body import hexapod
+from lgmdjax.body import robot_xml
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.errors import InputError
 from lgmdjax.reporting import selection, third_person, video_io
 from lgmdjax.reporting.figures.style import DARK, LEFT_COLOUR, LIGHT_GREY, RED, RIGHT_COLOUR, STYLE
@@ -119,21 +120,28 @@ def write_video(
     lj.write_video("walk.mp4", record, rooms)
     ```
     """
-    write_trace(Path(path), *choose_trace(record, room, robot, index), seconds)
+    robot = robot or assembly.load_robot()
+    write_trace(Path(path), *choose_trace(record, room, robot, index), seconds, body=robot.body)
     return Path(path)
 
 
 def choose_trace(
-    record: Record, room: Room | arena.Arena, robot: closed_loop.Params | None = None, index: int | None = None
+    record: Record, room: Room | arena.Arena, robot: closed_loop.Params, index: int | None = None
 ) -> tuple[WalkTrace, arena.Arena, camera.Params]:
     """Return the walk that `write_video` shows, its room, and the camera of the eyes; arguments as there."""
     walk, scene = selection.choose_walk(record, room, index)
     trace = WalkTrace(*(getattr(walk, name) for name in WalkTrace._fields))
-    return trace, scene, (robot or assembly.load_robot()).camera
+    return trace, scene, robot.camera
 
 
 def write_trace(
-    target: Path | BinaryIO, trace: WalkTrace, room: arena.Arena, eyes: camera.Params, seconds: float = 10.0
+    target: Path | BinaryIO,
+    trace: WalkTrace,
+    room: arena.Arena,
+    eyes: camera.Params,
+    seconds: float = 10.0,
+    *,
+    body: Body | None = None,
 ) -> int:
     """Write an MP4 video of a segment of a walk (`selection.select_segment`); return the number of images.
 
@@ -143,10 +151,12 @@ def write_trace(
         room: the room of the walk, or a batch with the room of each frame.
         eyes: camera of the eyes. Images are rendered in full width, and dimmed where the LGMDs do not see them.
         seconds: duration of the video; it is shorter if the walk is.
+        body: of the robot that walked; the package's if None.
     """
     _check(trace)
     frames = selection.select_segment(trace.position, trace.velocity, round(seconds * VIDEO_RATE) * FRAME_STRIDE)
-    views, robot = _views(trace, room, frames[::FRAME_STRIDE])
+    shown = frames[::FRAME_STRIDE]
+    views, robot = _views(trace, room, shown, body_geometry(to_qpos(trace, shown), body))
     page = _Page(trace, frames, (eyes.width, eyes.height))
     with video_io.open_writer(target, *VIDEO_SIZE, VIDEO_RATE) as write:
         for index, (view, eye_images) in enumerate(_render(views, robot, eyes)):
@@ -166,13 +176,14 @@ def _check(trace: WalkTrace) -> None:
             )
 
 
-def _views(trace: WalkTrace, room: arena.Arena, rows: Int[ndarray, " n"]) -> tuple[_Views, RobotCapsules]:
+def _views(
+    trace: WalkTrace, room: arena.Arena, rows: Int[ndarray, " n"], body: BodyGeometry
+) -> tuple[_Views, RobotCapsules]:
     """Compute the poses of cameras, eyes and limbs in the chosen frames, and their rooms."""
     position, heading = _smooth(trace)
     forward = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)[rows]
     target = position[rows]
     camera_position = target - CAMERA_BEHIND * forward + np.array([0, 0, CAMERA_ABOVE])
-    body = body_geometry(to_qpos(trace, rows))
     to_single = partial(jnp.asarray, dtype=jnp.float32)
     views = _Views(
         time=to_single(trace.time[rows]),
@@ -219,24 +230,44 @@ def to_qpos(trace: WalkTrace, rows: Int[ndarray, " n"]) -> Float[ndarray, "n 25"
     return np.concatenate([trace.position[rows], trace.quaternion[rows], joints], axis=1)
 
 
-def body_geometry(qpos: Float[ndarray, "n 25"]) -> BodyGeometry:
-    """Compute the robot's visible capsules and its eyes in n poses with C MuJoCo's kinematics."""
-    model = hexapod.load()
+def body_geometry(qpos: Float[ndarray, "n 25"], body: Body | None = None) -> BodyGeometry:
+    """Compute the robot's visible capsules and its eyes in n poses with C MuJoCo's kinematics.
+
+    Other shapes than spheres and capsules are drawn as capsules along their longest axis.
+    """
+    model = robot_xml.compiled(body)
     data = mujoco.MjData(model)
     visible = np.flatnonzero(model.geom_group == 2)
-    sites = [model.site(name).id for name in hexapod.EYES]
-    is_capsule = model.geom_type[visible] == mujoco.mjtGeom.mjGEOM_CAPSULE
-    half_length = np.where(is_capsule, model.geom_size[visible, 1], 0.0)
+    sites = [model.site(name).id for name in robot_xml.EYES]
+    axes, half_length, radii = _capsules(model, visible)
     rows = []
     for pose in qpos:
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
-        half_axis = data.geom_xmat[visible].reshape(-1, 3, 3)[..., 2] * half_length[:, None]
+        rotations = data.geom_xmat[visible].reshape(-1, 3, 3)
+        half_axis = np.take_along_axis(rotations, axes[:, None, None], axis=2)[..., 0] * half_length[:, None]
         centres, rotations = data.geom_xpos[visible], data.site_xmat[sites].reshape(2, 3, 3)
         rows.append((centres - half_axis, centres + half_axis, data.site_xpos[sites].copy(), rotations.copy()))
-    colours = model.mat_rgba[model.geom_matid[visible], :3]
+    material = model.geom_matid[visible, None]
+    colours = np.where(material < 0, model.geom_rgba[visible, :3], model.mat_rgba[material[:, 0], :3])
     starts, ends, eye_positions, eye_rotations = map(np.stack, zip(*rows, strict=True))
-    return BodyGeometry(starts, ends, eye_positions, eye_rotations, model.geom_size[visible, 0], colours)
+    return BodyGeometry(starts, ends, eye_positions, eye_rotations, radii, colours)
+
+
+def _capsules(
+    model: mujoco.MjModel, geoms: Int[ndarray, " n"]
+) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Float[ndarray, " n"]]:
+    """Return the axis along which each geom lies, and half the length and the radius of a capsule for it [m]."""
+    kinds, sizes = model.geom_type[geoms], model.geom_size[geoms]
+    axes, half_length, radii = np.full(len(geoms), 2), sizes[:, 1].copy(), sizes[:, 0].copy()
+    half_length[kinds == mujoco.mjtGeom.mjGEOM_SPHERE] = 0.0
+    for index in np.flatnonzero(~np.isin(kinds, (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE))):
+        is_round = kinds[index] == mujoco.mjtGeom.mjGEOM_CYLINDER
+        half = sizes[index, [0, 0, 1]] if is_round else sizes[index]
+        axes[index] = np.argmax(half)
+        radii[index] = np.delete(half, axes[index]).mean()
+        half_length[index] = max(half.max() - radii[index], 0.0)
+    return axes, half_length, radii
 
 
 def _render(

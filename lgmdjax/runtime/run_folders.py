@@ -36,6 +36,7 @@ from lgmdjax.runtime import checksums, compiled_code, partial_files, schema, sto
 from lgmdjax.runtime.storage import JsonObject
 
 FORMAT = 2  # of the run folder; no stage is resumed in a folder of another format
+ABSENT = "none"  # in messages, in place of a setting that only one of two runs has
 SEED_LIMIT = 2**32  # in single precision JAX keeps the last 32 bits of a seed: greater seeds would repeat smaller ones
 
 StageFunction = Callable[[Path, Mapping[str, Path], Any, int], None]
@@ -268,8 +269,9 @@ def _check_same(run: Run, requested: JsonObject) -> None:
 
 def _first_difference(found: object, expected: object, key: str = "") -> tuple[str, object, object] | None:
     """Return the path and the two values of the first setting that differs; None if none does."""
-    if isinstance(found, dict) and isinstance(expected, dict) and found.keys() == expected.keys():
-        parts = [(name, found[name], expected[name]) for name in expected]
+    if isinstance(found, dict) and isinstance(expected, dict):
+        names = dict.fromkeys((*expected, *found))
+        parts = [(name, found.get(name, ABSENT), expected.get(name, ABSENT)) for name in names]
     elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
         parts = [(index, *pair) for index, pair in enumerate(zip(found, expected, strict=True))]
     else:

@@ -76,6 +76,22 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Texts:
+    """A list of texts that are not empty: of `length` of them, or of one or more."""
+
+    length: int | None = None
+
+    def __str__(self) -> str:
+        return f"a list of {self.length or 'one or more'} texts"
+
+    def accepts(self, value: object) -> bool:
+        """Tell whether a value is such a list."""
+        if not isinstance(value, list) or not all(isinstance(item, str) and item for item in value):
+            return False
+        return bool(value) if self.length is None else len(value) == self.length
+
+
+@dataclass(frozen=True)
 class Numbers:
     """An array of finite floats of a shape, in a range."""
 
@@ -108,7 +124,7 @@ class Object:
         return isinstance(value, Mapping) and self.fields.keys() <= value.keys()
 
 
-Schema = Number | Flag | Text | Numbers | Object
+Schema = Number | Flag | Text | Texts | Numbers | Object
 
 
 def check(expected: Schema, value: object, place: str, remedy: str) -> None:

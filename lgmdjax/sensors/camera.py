@@ -27,6 +27,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from lgmdjax.body.robot_xml import Offset
 from lgmdjax.errors import InputError
 from lgmdjax.html import NotebookTable
 from lgmdjax.sensors import antialiasing, compositing, hemifield, silhouettes
@@ -69,6 +70,8 @@ class Params(NotebookTable):
     """Number of prisms that a tile holds, the nearest ones (`max_tile_occupancy` counts how many there are)."""
     bands: int = struct.field(pytree_node=False, default=3)
     """Number of texture scales, each less than half of the one before."""
+    mounts: tuple[Offset, Offset] | None = struct.field(pytree_node=False, default=None)
+    """Where the eyes sit in the trunk's frame [m], left first; where those of the package's robot do if None."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "samples", "tile_capacity", "bands"):

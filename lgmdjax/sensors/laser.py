@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
+from lgmdjax.body.robot_xml import Offset
 from lgmdjax.errors import InputError
 from lgmdjax.html import NotebookTable
 from lgmdjax.minmax import amin, maximum, minimum
@@ -36,9 +37,13 @@ from lgmdjax.world.arena import Arena
 
 @struct.dataclass(kw_only=True)
 class Params(NotebookTable):
-    """Number of rays, field of view [rad] and largest range [m] of the scanner (sec. 3.1), and the corridor (ours)."""
+    """Number of rays, field of view [rad] and largest range [m] of the scanner (sec. 3.1), and the corridor (ours).
+
+    The mount is where the scanner sits; where that of the package's robot does if None.
+    """
 
     rays: int = struct.field(pytree_node=False, default=341)
+    mount: Offset | None = struct.field(pytree_node=False, default=None)  # m, in the trunk's frame
     fov: float = math.radians(170.0)
     max_range: float = 5.0
     corridor_half_width: float = 0.15  # w, m

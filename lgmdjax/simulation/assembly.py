@@ -9,12 +9,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import PyTree
 
+from lgmdjax.body import robot_xml
 from lgmdjax.control import braitenberg, compass, controller, navigator, policies
 from lgmdjax.control.names import POLICY_NAMES, PolicyName
 from lgmdjax.detectors import lgmd, protocol
 from lgmdjax.detectors.protocol import Detector
 from lgmdjax.errors import InputError
-from lgmdjax.locomotion import cpg, shaping
+from lgmdjax.locomotion import cpg, shaping, tripod_gait
 from lgmdjax.paths import PRETRAINED_DIR
 from lgmdjax.runtime import checksums, schema, static_arguments
 from lgmdjax.runtime.storage import JsonObject, read_arrays, read_json
@@ -41,10 +42,19 @@ BASELINES = schema.Object(
 """Schema of baselines.npz: the gain of policy direct [1/m], and velocities [nominal] of policy random."""
 
 
-def camera_params(settings: CameraSettings) -> camera.Params:
-    """Return the stereo camera of these settings."""
+def camera_params(settings: CameraSettings, body: robot_xml.Body | None = None) -> camera.Params:
+    """Return the stereo camera of these settings on a body; on the package's if None."""
     of_detector = ("pooling", "falloff")
-    return camera.Params(**{name: value for name, value in asdict(settings).items() if name not in of_detector})
+    of_camera = {name: value for name, value in asdict(settings).items() if name not in of_detector}
+    return camera.Params(**of_camera, mounts=None if body is None else robot_xml.sensor_mounts(body).eyes)
+
+
+def laser_params(body: robot_xml.Body | None) -> laser.Params:
+    """Return the laser scanner of a body, whose corridor is as wide as its stance in proportion."""
+    if body is None:
+        return laser.Params()
+    half_width = laser.Params().corridor_half_width * tripod_gait.read_gait(robot_xml.compiled(body)).width_ratio()
+    return laser.Params(mount=robot_xml.sensor_mounts(body).laser, corridor_half_width=half_width)
 
 
 def camera_settings(robot: closed_loop.Params) -> CameraSettings:
@@ -149,14 +159,16 @@ def assemble_robot(
     lgmd_params: lgmd.Params,
     policy_params: policies.PolicySwitch,
 ) -> closed_loop.Params:
-    """Return a robot with the fitted gait of a run, and the given camera, detector and policies."""
+    """Return a robot with the body and the fitted gait of a run, and the given camera, detector and policies."""
+    body = robot_xml.read_body(gait_folder)
     params = assemble(
         policy_params,
         detector_params=lgmd_params,
         shaping_params=shaping.load(gait_folder / "shaping.safetensors"),
-        camera_params=camera_params(camera_settings),
+        camera_params=camera_params(camera_settings, body),
+        laser_params=laser_params(body),
     )
-    return with_camera(params, camera_settings)
+    return with_camera(replace(params, body=body), camera_settings)
 
 
 def make_policies(
@@ -195,7 +207,8 @@ def with_camera(params: closed_loop.Params, settings: CameraSettings) -> closed_
     `settings.pooling` keeps the visual angle of a detector's cell, so that its responses change little.
     """
     detector = fit_detector(params.controller.detector, settings)
-    return replace(params, camera=camera_params(settings), controller=replace(params.controller, detector=detector))
+    eyes = camera_params(settings, params.body)
+    return replace(params, camera=eyes, controller=replace(params.controller, detector=detector))
 
 
 def with_detector(robot: closed_loop.Params, model: Detector, params: PyTree = None) -> closed_loop.Params:

@@ -49,7 +49,7 @@ SUBSTEPS = 6  # physics steps a frame; the time step in the robot's XML is 1 / (
 
 @struct.dataclass(kw_only=True)
 class Params(NotebookTable):
-    """Parameters of a robot, except its body: controller, teacher, and sensors."""
+    """Parameters of a robot: controller, teacher, sensors, and which body it has (`build_model`)."""
 
     controller: controller.Params
     teacher: braitenberg.Params  # of the rule that labels the frames
@@ -58,6 +58,7 @@ class Params(NotebookTable):
     frame_stride: Int[Array, ""] | None = None  # frames from one picture to the next, 1 if None; u is held in between
     head_sway: Float[Array, ""] | None = None  # sway of the head, as a multiple of the trunk's, 1 if None
     heading: compass.Params | None = None  # of a robot that keeps the heading of its start; None for one without a goal
+    body: hexapod.Body | None = struct.field(pytree_node=False, default=None)  # the package's if None
 
 
 @struct.dataclass(kw_only=True)
@@ -132,6 +133,11 @@ def frame_type(camera_params: camera.Params) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(camera.image_shape(camera_params)[1:], jnp.result_type(float))
 
 
+def build_model(params: Params) -> mjx.Model:
+    """Return the model of a robot's body, in JAX's current default precision."""
+    return hexapod.build(hexapod.load(params.body))
+
+
 def init(params: Params, model: mjx.Model, room: Room, policy: Policy) -> State:
     """Return the state of a robot at the room's first start, its CPG on the limit cycle, before the first picture."""
     black, faults = jnp.zeros(camera.image_shape(params.camera)), room.faults
@@ -169,7 +175,7 @@ def step(
     Gradient: through all that `grad_path` names. With "body" the pictures and the detectors' responses are held
     constant; with "controller" also the label, the distances and the body.
     """
-    state = reset(params, room, state, policy)
+    state = reset(params, model, room, state, policy)
     scene = arena.at_time(room.arena, state.frame / FRAME_RATE)
     state, observation = observe(params, scene, state, render, room.faults)
     if grad_path != "everything":
@@ -181,7 +187,7 @@ def step(
     moved, clearance = move(mover[0], model, scene, mover[1])
     moved = replace(moved, controller=replace(state.controller, cpg=moved.controller.cpg))
     record = _record(state, observation, label, clearance)
-    return freeze_unhealthy(state, moved), record
+    return freeze_unhealthy(model, state, moved), record
 
 
 def _hold_vision(state: State, observation: Observation) -> tuple[State, Observation]:
@@ -192,14 +198,14 @@ def _hold_vision(state: State, observation: Observation) -> tuple[State, Observa
     return held, replace(observation, **outputs)
 
 
-def reset(params: Params, room: Room, state: State, policy: Policy) -> State:
+def reset(params: Params, model: mjx.Model, room: Room, state: State, policy: Policy) -> State:
     """Reset a robot after contact to the room's next start, with new policy and teacher states; the CPG continues."""
     resets = state.resets + 1
     start = jnp.take(room.starts, resets, axis=0, mode="wrap")
     policy_state = policy.init(params.controller.policy, jax.random.fold_in(room.key, resets))
     at_start = replace(
         state,
-        data=hexapod.reset(state.data, start),
+        data=hexapod.reset(model, state.data, start),
         controller=replace(state.controller, policy=policy_state),
         teacher=braitenberg.init(params.teacher),
         heading=_init_heading(params, room, resets),
@@ -230,7 +236,7 @@ def sense(
 ) -> tuple[Float[Array, "2 height columns"], Float[Array, " rays"]]:
     """Return both pictures [grey, 0..255] and the laser's ranges [m] from the robot's present pose."""
     pose = hexapod.pose(state.data)
-    ranges = laser.scan(params.laser, scene, *hexapod.laser_pose(pose))
+    ranges = laser.scan(params.laser, scene, *hexapod.laser_pose(pose, params.laser.mount))
     head = pose if params.head_sway is None else hexapod.scale_tilt(pose, params.head_sway)
     return render_stereo(params.camera, scene, head, render), ranges
 
@@ -275,7 +281,8 @@ def render_stereo(
     if render is False:
         return black
     unknown = jax.lax.optimization_barrier(jnp.asarray(render))
-    return jax.lax.cond(unknown, lambda: camera.render(camera_params, scene, *hexapod.eye_poses(pose)), lambda: black)
+    eyes = hexapod.eye_poses(pose, camera_params.mounts)
+    return jax.lax.cond(unknown, lambda: camera.render(camera_params, scene, *eyes), lambda: black)
 
 
 def decide(params: Params, state: State, observation: Observation, policy: Policy) -> tuple[State, Float[Array, "2"]]:
@@ -363,9 +370,9 @@ def _record(state: State, observation: Observation, label: Float[Array, "2"], cl
     )
 
 
-def freeze_unhealthy(before: State, after: State) -> State:
+def freeze_unhealthy(model: mjx.Model, before: State, after: State) -> State:
     """Freeze a robot permanently in its last healthy state if it fell or became non-finite; it still counts frames."""
-    ok = before.ok & hexapod.is_healthy(after.data)
+    ok = before.ok & hexapod.is_healthy(model, after.data)
     return replace(_where(ok, after, before), ok=ok, frame=after.frame)
 
 

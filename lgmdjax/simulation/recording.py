@@ -8,7 +8,6 @@ import jax
 import numpy as np
 from tqdm.auto import tqdm
 
-from lgmdjax.body import hexapod
 from lgmdjax.control import policies
 from lgmdjax.control.names import PolicyName
 from lgmdjax.runtime import interruption
@@ -56,7 +55,7 @@ def rollout(
     chosen = policies.get_policy(policy)
     batches = rollout_in_batches(
         select_policy(robot, chosen),
-        hexapod.build(),
+        closed_loop.build_model(robot),
         rooms,
         seconds,
         chosen.name,
@@ -146,7 +145,7 @@ def record_rollouts(
     writer = episodes.Writer(folder, parameters)
     batches = rollout_in_batches(
         select_policy(params, policy),
-        hexapod.build(),
+        closed_loop.build_model(params),
         rooms,
         seconds,
         f"{label}: {policy.name}",

@@ -52,7 +52,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from tqdm.auto import tqdm
 
-from lgmdjax.body import hexapod
 from lgmdjax.control import controller, policies
 from lgmdjax.detectors import lgmd
 from lgmdjax.evaluation import metrics
@@ -62,7 +61,7 @@ from lgmdjax.locomotion import cpg
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage, tracking
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.simulation import assembly, recording, room_batches
+from lgmdjax.simulation import assembly, closed_loop, recording, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, GradPath, Params, Record, Room
 from lgmdjax.studies.settings import FinetuneSettings
 
@@ -172,7 +171,7 @@ def finetune_learner(
             bar.update()
 
         after, stats = finetuning.finetune(
-            robot, hexapod.build(), partial(_rooms, seed, training.robots), window, finetune_settings,
+            robot, closed_loop.build_model(robot), partial(_rooms, seed, training.robots), window, finetune_settings,
             checkpoints=checkpoints, on_window=on_window, label=tracking.name_fit(folder),
         )  # fmt: skip
     columns = zip(finetuning.WindowStats._fields, zip(*stats, strict=True), strict=True)

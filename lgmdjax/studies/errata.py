@@ -28,7 +28,7 @@ from lgmdjax.body import hexapod
 from lgmdjax.control import policies
 from lgmdjax.evaluation import gait_test, metrics
 from lgmdjax.learning import lgmd_grid_search
-from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping
+from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import compiled_code, storage
 from lgmdjax.runtime.storage import JsonObject
@@ -47,8 +47,9 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: ErrataSettings, seed
     robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.benchmark.eyes)
     literal = folder / "literal.safetensors"
     if not literal.exists():  # a second fit might differ in the last bits, and the recorded walks would not match
-        geometry = kinematics.read_geometry(hexapod.load())
-        networks = gait_fit.fit(geometry, key=jax.random.key(seed), steps=FIT_STEPS, printed_input=True)
+        body = hexapod.load(robot.body)
+        geometry, gait = kinematics.read_geometry(body), tripod_gait.read_gait(body)
+        networks = gait_fit.fit(geometry, gait, key=jax.random.key(seed), steps=FIT_STEPS, printed_input=True)
         shaping.save(literal, networks, {"steps": FIT_STEPS, "seed": seed})
     rows = []
     for name, change in CASES.items():
@@ -61,7 +62,7 @@ def _measure(folder: Path, name: str, robot: closed_loop.Params, settings: Errat
     """Return the row of a case: its walk on the empty floor, and its walks in the benchmark rooms."""
     controller_params, steps = robot.controller, round(SECONDS / gait_test.TIME_STEP)
     targets = gait_test.servo_targets(controller_params.cpg, controller_params.shaping, jnp.ones(2), steps=steps)
-    trajectory = gait_test.simulate_mujoco(hexapod.load(), targets)
+    trajectory = gait_test.simulate_mujoco(hexapod.load(robot.body), targets)
     gait = gait_test.measure_gait(trajectory, float(controller_params.cpg.cycle_time))
     case_folder = folder / "".join(c if c.isalnum() else "-" for c in name)
     walks = {

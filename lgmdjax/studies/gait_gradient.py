@@ -50,7 +50,7 @@ from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import storage, tracking
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.simulation import assembly, sharding
+from lgmdjax.simulation import assembly, closed_loop, sharding
 from lgmdjax.studies.settings import GaitGradientSettings
 
 STRAIGHT = (-1.0, 0.5, 1.0, 1.5, 2.0)
@@ -78,9 +78,9 @@ class RobotTask:
 
 def run(folder: Path, inputs: Mapping[str, Path], settings: GaitGradientSettings, seed: int) -> None:
     """Fit the gait by both methods with every random seed, and evaluate the results."""
-    robot = assembly.load_robot(inputs["fit-gait"], inputs["train"]).controller
-    params, model = gait_objective.from_shaping(robot.shaping), hexapod.build()
-    rows = [{"method": "initial", "repeat": 0, "curve": []} | measure_gait(params)]
+    robot = assembly.load_robot(inputs["fit-gait"], inputs["train"])
+    params, model = gait_objective.from_shaping(robot.controller.shaping), closed_loop.build_model(robot)
+    rows = [{"method": "initial", "repeat": 0, "curve": []} | measure_gait(params, body=robot.body)]
     window = round(settings.window / gait_test.TIME_STEP)
     tasks = [initial_tasks(params, model, jax.random.key(seed + repeat), window) for repeat in range(settings.seeds)]
     for method in METHODS:
@@ -91,7 +91,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: GaitGradientSettings
             numbers = {name: float(getattr(fitted, name)) for name in ("cycle_time", "within", "across")}
             shaping.save(path, gait_objective.unpack(fitted)[1], numbers | {"seed": seed + repeat})
             row = {"method": method, "repeat": repeat, "curve": curve, "seconds": seconds}
-            rows.append(row | numbers | measure_gait(fitted))
+            rows.append(row | numbers | measure_gait(fitted, body=robot.body))
     storage.write_json(folder / "gait_gradient.json", rows)
 
 
@@ -128,7 +128,7 @@ def prepare_optimisation(
     def loss(scaled: GaitParams, task: RobotTask) -> tuple[Float[Array, ""], GaitState]:
         own = jax.tree.map(jnp.multiply, scaled, param_scales)
         summary, end = gait_objective.rollout(own, model, task.state, task.velocity, window)
-        sound = hexapod.is_healthy(end.data)
+        sound = hexapod.is_healthy(model, end.data)
         return jnp.where(sound, window_loss(summary, task.velocity, task.first), jnp.nan), end
 
     gradient = METHODS[method](loss, settings)
@@ -143,7 +143,7 @@ def prepare_optimisation(
     def update(scaled: GaitParams, opt_state: optax.OptState, tasks: RobotTask, initial: RobotTask, key: Array):
         value, grad, ends = gradient(scaled, tasks, key)
         changes, opt_state = optimiser.update(grad, opt_state)
-        return jax.tree.map(jnp.add, scaled, changes), opt_state, continue_tasks(tasks, ends, initial), value
+        return jax.tree.map(jnp.add, scaled, changes), opt_state, continue_tasks(model, tasks, ends, initial), value
 
     return Optimisation(
         label=method, robot_seconds=robot_seconds, steps=steps, param_scales=param_scales, optimiser=optimiser,
@@ -188,11 +188,11 @@ def initial_tasks(params: GaitParams, model: mjx.Model, key: Array, window: int)
     return jax.jit(partial(sharding.shard_robots, jax.vmap(one)))(phases, velocities)
 
 
-def continue_tasks(tasks: RobotTask, ends: GaitState, initial: RobotTask) -> RobotTask:
+def continue_tasks(model: mjx.Model, tasks: RobotTask, ends: GaitState, initial: RobotTask) -> RobotTask:
     """Return the tasks of the next window; robots that fell start from their initial state."""
 
     def one(end: GaitState, initial: GaitState) -> GaitState:
-        return jax.tree.map(partial(jnp.where, hexapod.is_healthy(end.data)), end, initial)
+        return jax.tree.map(partial(jnp.where, hexapod.is_healthy(model, end.data)), end, initial)
 
     return replace(tasks, state=jax.vmap(one)(ends, initial.state))
 
@@ -241,14 +241,14 @@ def _evolution_strategy(loss: Loss[P, T, E], settings: GaitGradientSettings) -> 
 METHODS = {"gradient": _reverse_mode, "evolution": _evolution_strategy}
 
 
-def measure_gait(params: GaitParams, seconds: float = 12.0) -> JsonObject:
+def measure_gait(params: GaitParams, seconds: float = 12.0, body: hexapod.Body | None = None) -> JsonObject:
     """Simulate straight walks in C MuJoCo, and return speed error and sway at every velocity."""
     cpg_params, networks = gait_objective.unpack(params)
     steps = round(seconds / gait_test.TIME_STEP)
     rows = []
     for velocity in STRAIGHT:
         targets = gait_test.servo_targets(cpg_params, networks, jnp.full(2, velocity), steps=steps)
-        gait = gait_test.measure_gait(gait_test.simulate_mujoco(hexapod.load(), targets), float(params.cycle_time))
+        gait = gait_test.measure_gait(gait_test.simulate_mujoco(hexapod.load(body), targets), float(params.cycle_time))
         error = abs(gait.speed - NOMINAL_SPEED * velocity)
         rows.append((velocity, gait.speed, error, gait.pitch, gait.roll, gait.drift))
     table = np.array(rows)

@@ -62,7 +62,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: GradientHorizonSetti
     with jax.enable_x64(True):
         robot = assembly.with_resolution(assembly.load_robot(inputs["fit-gait"], inputs["train"]), settings.eyes)
         robot = rollout_gradient.smooth_thresholds(rollout_gradient.learned_only(robot))
-        rooms, model = room_batches.training_rooms(seed, 0, settings.robots), hexapod.build()
+        rooms, model = room_batches.training_rooms(seed, 0, settings.robots), closed_loop.build_model(robot)
         models = {"hard": model, "soft": hexapod.soften_contacts(model)}
         recorded = {
             contact: _on_host((robot, own, rooms, states_before_end(robot, own, rooms)))

@@ -77,7 +77,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: VelocitySettings, se
             folder / f"{velocity:g}", with_velocity(robot, velocity), benchmark, policies.BLIND, seed,
             label=f"v = {velocity:g}", render=True,
         )  # fmt: skip
-        ahead = distance_ahead(room_batches.benchmark_rooms(benchmark, seed).arena, record)
+        ahead = distance_ahead(room_batches.benchmark_rooms(benchmark, seed).arena, record, robot.laser.mount)
         measured.append(score_velocity(velocity, record, ahead, float(robot.controller.detector.suppression)))
     storage.write_json(folder / "velocity.json", [asdict(row) for row in mark_best(measured)])
 
@@ -87,13 +87,15 @@ def with_velocity(robot: closed_loop.Params, velocity: float) -> closed_loop.Par
     return assembly.with_policy(robot, "blind", policies.BlindParams(velocity=jnp.full(2, velocity, dtype=float)))
 
 
-def distance_ahead(rooms: arena.Arena, record: closed_loop.Record) -> Float[np.ndarray, "robots frames"]:
+def distance_ahead(
+    rooms: arena.Arena, record: closed_loop.Record, mount: hexapod.Offset | None = None
+) -> Float[np.ndarray, "robots frames"]:
     """Measure the distance from the laser to the nearest thing in a sector straight ahead [m]."""
     scanner = laser.Params(rays=21, fov=SECTOR)
 
     def nearest(room: arena.Arena, position: Array, quaternion: Array) -> Array:
         pose = hexapod.Pose(position=position, quaternion=quaternion)
-        return jnp.min(laser.scan(scanner, room, *hexapod.laser_pose(pose)))
+        return jnp.min(laser.scan(scanner, room, *hexapod.laser_pose(pose, mount)))
 
     nearest_by_frame = jax.vmap(nearest, in_axes=(None, 0, 0))
     poses = (jnp.asarray(record.position), jnp.asarray(record.quaternion))

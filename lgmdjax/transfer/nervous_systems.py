@@ -58,7 +58,7 @@ def init(params: closed_loop.Params, faults: Faults, key: Array) -> State:
         label=zero,
         is_first=jnp.asarray(True),
         cameras=camera_faults.init(faults.camera, whole, jax.random.fold_in(key, 1)),
-        servos=servo_faults.init(faults.servos, jnp.asarray(hexapod.stance(), jnp.float32)),
+        servos=servo_faults.init(faults.servos, jnp.asarray(hexapod.stance(params.body), jnp.float32)),
     )
 
 
@@ -99,7 +99,7 @@ def _previous(state: State, pictures: Array) -> Array:
 def next_targets(params: closed_loop.Params, faults: Faults, state: State) -> tuple[State, Float[Array, "6 3"]]:
     """Advance the CPG by `INTERVAL`; return the set points [rad] that arrive at the joints."""
     moved, targets = controller.move(params.controller, state.controller, INTERVAL)
-    limits = jnp.asarray(hexapod.target_limits(), targets.dtype)
+    limits = jnp.asarray(hexapod.target_limits(params.body), targets.dtype)
     servos, arrived = servo_faults.step(faults.servos, state.servos, clip(targets, *limits), INTERVAL)
     return replace(state, controller=moved, servos=servos), arrived
 

@@ -8,7 +8,7 @@ in hard contacts with the friction of the geoms.
 import mujoco
 import numpy as np
 
-from lgmdjax.body import hexapod
+from lgmdjax.body import robot_xml
 from lgmdjax.transfer import cube_camera
 from lgmdjax.world import mujoco_world
 from lgmdjax.world.arena import Arena
@@ -17,7 +17,14 @@ from lgmdjax.world.mujoco_world import PHOTOGRAPHIC, ROBOT, WORLD, Style
 DRAWN = 2  # group of the robot's visible geoms in the XML
 
 
-def build(room: Arena, style: Style = PHOTOGRAPHIC, *, seed: int = 0, face: int = cube_camera.FACE) -> mujoco.MjModel:
+def build(
+    room: Arena,
+    style: Style = PHOTOGRAPHIC,
+    *,
+    seed: int = 0,
+    face: int = cube_camera.FACE,
+    body: robot_xml.Body | None = None,
+) -> mujoco.MjModel:
     """Return the robot's model with a single room around it.
 
     Args:
@@ -25,8 +32,9 @@ def build(room: Arena, style: Style = PHOTOGRAPHIC, *, seed: int = 0, face: int 
         style: appearance of the room.
         seed: seed of textures and shapes.
         face: width of a face of the cube cameras [px].
+        body: of the robot; the package's if None.
     """
-    spec = mujoco.MjSpec.from_file(str(hexapod.xml_path()))
+    spec = robot_xml.read_spec(body)
     for pair in list(spec.pairs):
         spec.delete(pair)
     for geom in [geom for geom in spec.geoms if geom.name.startswith("before_")]:

@@ -77,7 +77,7 @@ def walk(
     """
     count = len(rooms.starts)
     drawn = [draw(jax.random.fold_in(rooms.key[k], world.seed), *world.faults) for k in range(count)]
-    bodies = [_body(jax.tree.map(lambda leaf, k=k: leaf[k], rooms), drawn[k], world, k) for k in range(count)]
+    bodies = [_body(robot, jax.tree.map(lambda leaf, k=k: leaf[k], rooms), drawn[k], world, k) for k in range(count)]
     chosen = policies.get_policy(policy)
     with ExitStack() as stack:
         cameras = [
@@ -154,7 +154,7 @@ class _Batch:
             body.data.ctrl[:] = targets[index]
             mujoco.mj_step(body.model, body.data)
             touched[index] = body.touchable[body.data.contact.geom].any()
-            self.ok[index] = is_healthy(body.data)
+            self.ok[index] = is_healthy(body.model, body.data)
         return touched
 
     def _scan(self, body: _Body) -> np.ndarray:
@@ -199,17 +199,17 @@ class _Batch:
         }
 
 
-def is_healthy(data: mujoco.MjData) -> bool:
+def is_healthy(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
     """Return whether the state is finite and the robot on its feet, as `hexapod.is_healthy` does."""
-    height, (x, y) = data.qpos[2], data.qpos[4:6]
+    height, (x, y) = data.qpos[2] / model.key("stance").qpos[2], data.qpos[4:6]
     upright = 1 - 2 * (x * x + y * y) > hexapod.MIN_UPRIGHT
     return bool(
         upright and hexapod.MIN_TRUNK_HEIGHT < height < hexapod.MAX_TRUNK_HEIGHT and np.isfinite(data.qvel).all()
     )
 
 
-def _body(room: Room, faults: Faults, world: World, index: int) -> _Body:
-    model = robot_model.build(room.arena, world.style, seed=world.seed + index)
+def _body(robot: closed_loop.Params, room: Room, faults: Faults, world: World, index: int) -> _Body:
+    model = robot_model.build(room.arena, world.style, seed=world.seed + index, body=robot.body)
     model = servo_faults.apply_to_model(model, faults.body)
     data, starts = mujoco.MjData(model), np.asarray(room.starts, float)
     robot_model.reset(model, data, starts[0])

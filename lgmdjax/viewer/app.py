@@ -6,7 +6,7 @@ from pathlib import Path
 from lgmdjax.paths import DATA_DIR
 from lgmdjax.reporting import playback as playbacks
 from lgmdjax.viewer import server as web
-from lgmdjax.viewer.messages import Live
+from lgmdjax.viewer.messages import Live, Walks
 from lgmdjax.viewer.page import Viewer
 from lgmdjax.viewer.walk_paths import find_walks
 
@@ -26,7 +26,7 @@ class Address:
 def run_demo(address: Address, out: Path) -> None:
     """Show the walk that comes with the package, until the user interrupts."""
     viewer = Viewer(web.start(address.host, address.port), out)
-    viewer.play(playbacks.load(DEMO))
+    viewer.play(Walks((), 0, playbacks.load(DEMO)))
     _announce(viewer, address)
     viewer.run()
 
@@ -37,7 +37,7 @@ def run_view(path: Path | None, address: Address, out: Path, live: Live) -> None
         find_walks(path)
     viewer = Viewer(web.start(address.host, address.port), out, live.run)
     if path is None:
-        viewer.play(playbacks.load(DEMO))
+        viewer.play(Walks((), 0, playbacks.load(DEMO)))
         viewer.live_panel.room.value, viewer.live_panel.seed.value = live.room, live.seed
         viewer.start_live()
     else:

@@ -58,7 +58,7 @@ class LiveRecording:
             rooms = rooms_at(self.room, np.stack(self.centres))
             seconds = min(VIDEO_SECONDS, len(self.records) / closed_loop.FRAME_RATE / 2)
             trace = walk_video.WalkTrace(*(getattr(record, name)[0] for name in walk_video.WalkTrace._fields))
-            walk_video.write_trace(partial / "walk.mp4", trace, rooms, robot.camera, seconds)
+            walk_video.write_trace(partial / "walk.mp4", trace, rooms, robot.camera, seconds, body=robot.body)
         return folder
 
     def _edits(self) -> JsonObject:

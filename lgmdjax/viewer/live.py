@@ -10,12 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgmdjax.body import hexapod
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import trials
 from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.reporting import room_shape
-from lgmdjax.simulation import assembly, room_batches
+from lgmdjax.simulation import assembly, closed_loop, room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
 from lgmdjax.viewer import edits, live_step
 from lgmdjax.viewer.messages import (
@@ -47,7 +46,7 @@ class LiveSimulation:
         self.command, self.report = command, report
         run = command.run
         self.robot = assembly.load_robot(run / "fit-gait", run / "train") if run else assembly.load_robot()
-        self.model = hexapod.build()
+        self.model = closed_loop.build_model(self.robot)
         self.room = sample_room(command.room, command.seed)
         self.controls, self.params = controls, live_step.steer(self.robot, controls)
         report(Status("live: compiling the simulation, which takes a minute or two the first time"))
@@ -62,7 +61,7 @@ class LiveSimulation:
         """Return the room, and the constants of the robot's detectors."""
         detector = self.robot.controller.detector
         constants = Constants(*(float(getattr(detector, name)) for name in Constants._fields))
-        return Entered(room_shape.shape_of(self.room.arena), self._centres(), constants)
+        return Entered(room_shape.shape_of(self.room.arena), self._centres(), constants, self.robot.body)
 
     def is_due(self) -> bool:
         """Return whether it is time for the next frame."""
@@ -80,7 +79,9 @@ class LiveSimulation:
             case Move():
                 self.room = replace(self.room, arena=edits.move(self.room.arena, *command))
             case Place():
-                self.state = live_step.place(self.params, self.room, self.state, jnp.asarray(command, float))
+                self.state = live_step.place(
+                    self.params, self.model, self.room, self.state, jnp.asarray(command, float)
+                )
             case Step():
                 self.steps += 1
             case RecordCommand(on=True):

@@ -138,11 +138,15 @@ def start_replay(params: closed_loop.Params) -> lgmd.State:
 
 @cached_jit
 def place(
-    params: closed_loop.Params, room: closed_loop.Room, state: closed_loop.State, pose: Float[Array, "3"]
+    params: closed_loop.Params,
+    model: mjx.Model,
+    room: closed_loop.Room,
+    state: closed_loop.State,
+    pose: Float[Array, "3"],
 ) -> closed_loop.State:
     """Return the state with the robot at rest at x, y, yaw, policy and teacher new, as after a reset on contact."""
     there = replace(room, starts=jnp.broadcast_to(pose, room.starts.shape))
-    after = closed_loop.reset(params, there, replace(state, contact=jnp.asarray(True)), STEERED)
+    after = closed_loop.reset(params, model, there, replace(state, contact=jnp.asarray(True)), STEERED)
     return replace(after, contact=jnp.asarray(False), ok=jnp.asarray(True))
 
 

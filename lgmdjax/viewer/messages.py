@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 from numpy import ndarray
 
+from lgmdjax.body.robot_xml import Body
 from lgmdjax.control.names import PolicyName
 from lgmdjax.reporting.playback import Playback, RoomShape
 
@@ -110,6 +111,7 @@ class Walks(NamedTuple):
     names: tuple[str, ...]
     index: int
     playback: Playback
+    body: Body | None = None  # of the robot that walked
 
 
 class SensedFrames(NamedTuple):
@@ -127,6 +129,7 @@ class Entered(NamedTuple):
     shape: RoomShape
     centres: ndarray
     constants: Constants
+    body: Body | None = None  # of the robot
 
 
 class LiveFrame(NamedTuple):

@@ -56,17 +56,18 @@ class Viewer:
         self.playback: Playback | None = None
         self.is_live, self.is_recording, self.contacts = False, False, 0
         self.opened: Open | None = None
-        self.names: tuple[str, ...] = ()
-        self.index, self.sensed, self._shown_frame = 0, 0, -1
+        self.walks: Walks | None = None
+        self.sensed, self._shown_frame = 0, -1
         # Calls that viser's threads leave to the loop.
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.scene = WalkScene(self.server)
         self._lay_out()
 
-    def play(self, playback: Playback, names: tuple[str, ...] = (), index: int = 0) -> None:
+    def play(self, walks: Walks) -> None:
         """Show a recorded walk from its beginning."""
-        self.is_live, self.playback, self.playing.frame = False, playback, 0.0
-        self.names, self.index = names, index
+        playback, names, index = walks.playback, walks.names, walks.index
+        self.is_live, self.walks, self.playback, self.playing.frame = False, walks, playback, 0.0
+        self.scene.set_body(walks.body)
         self.scene.set_room(playback.room, playback.centres_at(0))
         self.scene.trace(playback)
         self.scene.point_camera(playback.room)
@@ -123,7 +124,7 @@ class Viewer:
                 if failed:
                     self._fail(text)
             case Walks():
-                self.play(report.playback, report.names, report.index)
+                self.play(report)
             case SensedFrames():
                 self._add_senses(report)
             case Entered():
@@ -208,9 +209,9 @@ class Viewer:
 
     def _go_back(self) -> None:
         """Show the recorded walk again, while the live simulation is paused."""
-        if self.playback is not None:
+        if self.walks is not None and self.playback is not None:
             sensed = self.sensed
-            self.play(self.playback, self.names, self.index)
+            self.play(self.walks._replace(playback=self.playback))
             self.sensed = sensed
             self.status.content = "**recorded**"
 
@@ -261,6 +262,7 @@ class Viewer:
     def _enter(self, entered: Entered) -> None:
         self.is_live, self.contacts, self.is_recording = True, 0, False
         self.transport.folder.visible = False
+        self.scene.set_body(entered.body)
         self.scene.set_room(entered.shape, entered.centres)
         self.scene.enable_drag(lambda index, x, y: self.simulator.send(Move(index, x, y)))
         self.scene.point_camera(entered.shape)

@@ -64,7 +64,7 @@ class WalkSource:
             title=f"{self.folder.name}, {names[self.index]}", centres=self.centres
         )
         self.report(Status("rendering what the eyes saw; the first pictures take a minute"))
-        return Walks(names, self.index, playback)
+        return Walks(names, self.index, playback, self.robot.body)
 
     def is_behind(self) -> bool:
         """Return whether some frames are not rendered yet."""

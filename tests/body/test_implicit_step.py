@@ -92,7 +92,7 @@ def test_derivative_of_one_step_equals_c_mujocos_finite_difference(model, target
 
 
 def test_unsupported_versions_and_integrators_are_rejected(model, monkeypatch):
-    with pytest.raises(InputError, match=re.escape('integrator="Euler", got RK4')):
+    with pytest.raises(InputError, match=re.escape("got RK4")):
         implicit_step.check_supported(model.replace(opt=model.opt.replace(integrator=mjx.IntegratorType.RK4)))
     monkeypatch.setattr(implicit_step, "version", lambda package: "3.99.1")
     with pytest.raises(InputError, match=re.escape("expected mujoco-mjx 3.17, whose solver")):

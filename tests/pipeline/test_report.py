@@ -69,7 +69,7 @@ def source(run: Path) -> str:
 @pytest.fixture
 def copy(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the run folder to change; video and figures are left out."""
-    monkeypatch.setattr(walk_video, "write_trace", lambda *_: 0)
+    monkeypatch.setattr(walk_video, "write_trace", lambda *_, **__: 0)
     monkeypatch.setattr(style, "to_svg", lambda figure: b"")
     return shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("report"))
 

@@ -183,7 +183,7 @@ def test_a_trace_with_wrong_shapes_or_numbers_is_refused(walk: walk_video.WalkTr
 
 def test_a_video_of_a_record_shows_one_walk_in_its_own_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     written = []
-    monkeypatch.setattr(walk_video, "write_trace", lambda *arguments: written.append(arguments))
+    monkeypatch.setattr(walk_video, "write_trace", lambda *arguments, **_: written.append(arguments))
     velocity = np.zeros((2, 300, 2))
     velocity[1, :, 0] = 1.0
     record = synthetic.walk(2, 300, velocity=velocity)
@@ -200,7 +200,7 @@ def test_a_video_of_a_record_shows_one_walk_in_its_own_room(monkeypatch: pytest.
     for name, series in first._asdict().items():
         np.testing.assert_array_equal(series, getattr(single, name))
     monkeypatch.setattr(
-        walk_video, "write_trace", lambda target, *arguments: target.write(repr(arguments[-1]).encode())
+        walk_video, "write_trace", lambda target, *arguments, **_: target.write(repr(arguments[-1]).encode())
     )
     shown = inline_video.show_walk(record, rooms, robot, index=1, seconds=7.5)
     assert shown.data == b"7.5" and shown.save(tmp_path / "shown.mp4").read_bytes() == b"7.5"

@@ -97,7 +97,9 @@ def test_windows_continue_and_robots_that_fell_start_again(initial_coupling):
     data = initial.state.data
     ends = replace(initial.state, data=data.replace(qpos=data.qpos.at[:, 0].add(1.0)))
     for broken in (ends.data.qpos.at[1, 2].set(0.001), ends.data.qpos.at[1, 0].set(jnp.nan)):
-        after = gait_gradient.continue_tasks(initial, replace(ends, data=ends.data.replace(qpos=broken)), initial)
+        after = gait_gradient.continue_tasks(
+            model, initial, replace(ends, data=ends.data.replace(qpos=broken)), initial
+        )
         moved = after.state.data.qpos[:, 0] - data.qpos[:, 0]
         np.testing.assert_allclose(moved, np.where(np.arange(robots) == 1, 0.0, 1.0), atol=1e-12)
 

@@ -78,7 +78,7 @@ def test_no_control_needs_another_program(robot, room):
     before = types(params, room, state)
     other = live_step.steer(robot, Controls(policy="blind", threshold=1.0, suppression=9.0, inhibition=0.2, speed=0.5))
     moved = replace(room, arena=edits.move(edits.move(room.arena, 0, 1.0, 1.0), 13, 0.5, -1.0))
-    placed = live_step.place(params, room, state, jnp.array([1.0, -0.5, 2.0]))
+    placed = live_step.place(params, model, room, state, jnp.array([1.0, -0.5, 2.0]))
     assert types(other, moved, placed) == before
     for name in ("random", "dynamic"):
         assert types(live.sample_room(name, 3)) == types(room)
@@ -120,7 +120,7 @@ def test_an_unknown_room_is_one_line():
 
 def test_a_kept_walk_is_read_with_every_move_of_an_obstacle(room, robot, tmp_path, monkeypatch):
     films = []
-    monkeypatch.setattr("lgmdjax.reporting.walk_video.write_trace", lambda *arguments: films.append(arguments))
+    monkeypatch.setattr("lgmdjax.reporting.walk_video.write_trace", lambda *arguments, **_: films.append(arguments))
     record = synthetic.walk(1, 30)
     recording = edits.LiveRecording(room.arena)
     arena = room.arena
