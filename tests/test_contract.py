@@ -132,7 +132,7 @@ COMPONENTS = (
         "compass",
         lambda: compass.Params(drift=0.1),
         lambda params, first: compass.init(params, first[1], jnp.ones_like(first[1])),
-        lambda params, state, now: compass.step(params, state, *now, 1 / 30),
+        lambda params, state, now: compass.step(params, state, now[0], now[1], 1 / 30),
         commands_and_headings,
     ),
     Component("lgmd", smooth_lgmd, lgmd.init, lgmd.step, noise(12, 16)),

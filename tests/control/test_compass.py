@@ -38,7 +38,8 @@ def test_it_equals_its_equations():
     state = compass.init(PARAMS, jnp.asarray(0.4), jnp.asarray(-0.5))
 
     def step(state, now):
-        return compass.step(PARAMS, state, *now, INTERVAL)
+        velocity, yaw = now
+        return compass.step(PARAMS, state, velocity, yaw, INTERVAL)
 
     _, commanded = jax.lax.scan(step, state, (jnp.asarray(velocities), jnp.asarray(yaws)))
     np.testing.assert_allclose(commanded, transcribed(velocities, yaws, 0.4, -0.5 * 0.02), atol=1e-12)
@@ -82,7 +83,8 @@ def looking(state: closed_loop.State, yaw: float) -> closed_loop.State:
 
 def test_the_robot_turns_back_to_the_heading_of_its_start(blind):
     robot, room = blind
-    state = closed_loop.init(robot, hexapod.build(), room, policies.SWITCH)
+    model = hexapod.build()
+    state = closed_loop.init(robot, model, room, policies.SWITCH)
     observation = policies.Observation(**dict.fromkeys(("u", "feed_forward", "excitation"), jnp.zeros(2)),
                                        distances=jnp.full(2, 3.0), corridor=jnp.full(2, 3.0))  # fmt: skip
     for yaw, wish in ((0.5, 0.0), (0.0, 0.6), (1.5, -0.7)):
@@ -90,8 +92,8 @@ def test_the_robot_turns_back_to_the_heading_of_its_start(blind):
         turn = decided.controller.velocity[1] - decided.controller.velocity[0]
         np.testing.assert_allclose(turn, wish, atol=1e-6)
         np.testing.assert_allclose(label[0], label[1])  # the teacher's label is that without a heading
-    reset = closed_loop.reset(robot, room, replace(state, contact=jnp.asarray(True)), policies.SWITCH)
-    assert reset.heading is not None
+    reset = closed_loop.reset(robot, model, room, replace(state, contact=jnp.asarray(True)), policies.SWITCH)
+    assert reset.heading is not None and state.heading is not None
     np.testing.assert_allclose(reset.heading.wanted, -2.0)
     assert abs(float(reset.heading.drift)) <= 0.02 and reset.heading.drift != state.heading.drift
 

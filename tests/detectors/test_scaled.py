@@ -14,7 +14,7 @@ from lgmdjax.errors import InputError
 FRAMES = np.random.default_rng(0).uniform(97, 103, (6, 12, 16))
 
 
-def respond(params: scaled.Params, frames: np.ndarray) -> lgmd.Response:
+def respond(params: scaled.Params, frames: np.ndarray) -> scaled.Response:
     images = jnp.asarray(frames, float)
     return jax.lax.scan(partial(scaled.step, params), scaled.init(params, images[0]), images[1:])[1]
 

@@ -114,7 +114,7 @@ def test_it_walks_in_mjx_and_its_teacher_avoids_a_box(walker):
     assert mjx.speed == pytest.approx(0.05, rel=0.05) and mjx.speed == pytest.approx(c.speed, rel=0.01)
     assert abs(mjx.drift) < np.radians(2) and abs(c.drift) < np.radians(2)
     teacher = braitenberg.Params()
-    params = closed_loop.assemble(
+    params = assembly.assemble(
         teacher,
         shaping_params=networks,
         camera_params=assembly.camera_params(CAMERA, walker.body),

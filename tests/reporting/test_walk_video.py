@@ -81,7 +81,7 @@ def test_the_image_is_dimmed_outside_the_hemifield(walk: walk_video.WalkTrace):
 
 
 def test_eyes_are_fixed_to_the_trunk(walk: walk_video.WalkTrace):
-    body = walk_video.body_geometry(walk_video.to_qpos(walk, np.array([0, 150])))
+    body = walk_video.body_geometry(walk_video.to_qpos(walk, np.array([0, 150])), None)
     for row, position, rotation in zip((0, 150), body.eye_positions, body.eye_rotations, strict=True):
         yaw = 2 * np.arctan2(walk.quaternion[row, 3], walk.quaternion[row, 0])
         forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
