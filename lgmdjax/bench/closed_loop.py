@@ -134,7 +134,9 @@ def train_and_score(
     row |= {"calibration": next((each for each in candidates if each["chosen"]), None)}
     for world in worlds.WORLDS:
         records = [
-            _record_in(folder / f"seed-{repeat}" / world, learner, world, policies.LEARNED, size, seed, name=name)
+            _record_in(
+                folder / f"seed-{repeat}" / world, learner, world, policies.LEARNED, size=size, seed=seed, name=name
+            )
             for repeat, learner in enumerate(learners)
         ]
         row[world] = summarise(world, records, size)
@@ -180,7 +182,7 @@ def score_references(
         row: JsonObject = {"detector": policy.name}
         for world in (worlds.ROOMS, worlds.SCENES):
             place = folder / f"{policy.name}-{world}"
-            record = _record_in(place, robot, world, policy, settings.size, seed, name=policy.name)
+            record = _record_in(place, robot, world, policy, size=settings.size, seed=seed, name=policy.name)
             row[world] = summarise(world, [record], settings.size)
         rows.append(row)
     storage.write_json(folder / "scores.json", rows)
@@ -191,9 +193,9 @@ def _record_in(
     robot: closed_loop.Params,
     world: str,
     policy: policies.Policy,
+    *,
     size: ClosedLoopSettings,
     seed: int,
-    *,
     name: str,
 ) -> closed_loop.Record:
     """Record the walks of a robot in a world."""

@@ -45,6 +45,7 @@ POOLINGS = (1, 2, 3)  # px: cells of 2, 4 and 6 degrees of a picture of 80 px
 CONTRASTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 FILLED, FULL = 0.9, 0.9  # quantile of u, and its value
 SILENT = 1e-4  # a detector whose quantile of x, u = 1 / (1 + exp(-x)), is less does not respond
+NO_RESPONSE = -1.0  # score of a candidate that does not respond
 MIN_SECONDS = 10.0  # of steady walking, all robots together
 
 
@@ -83,10 +84,10 @@ def calibrate(
     known = assembly.with_detector(robot, scaled, scaled.Params(model=model, detector=detector))
     rows = list(_compare(known, record, pictures, steady))
     best = max(rows, key=lambda row: row.score)
-    if best.score <= 0:
+    if best.score <= NO_RESPONSE:
         raise InputError(
-            f"detector {protocol.name(model)}: expected a response that grows with nearness for some of {len(rows)} "
-            f"pairs of cells and contrast, got correlations up to {best.score:.2f}; change its constants"
+            f"detector {protocol.name(model)}: expected a response in a tenth of the frames for some of {len(rows)} "
+            "pairs of cells and contrast, got none; change its constants"
         )
     return with_candidate(known, best), [asdict(row) | {"chosen": row is best} for row in rows]
 
@@ -130,7 +131,7 @@ def judge(
     level, largest = float(np.quantile(x[steady], FILLED)), float(np.max(response.feed_forward[steady]))
     suppression = SUPPRESSION_MARGIN * largest if largest > 0 else None
     if not level > SILENT:
-        return Candidate(*pair, gain=1.0, suppression=suppression, score=0.0)
+        return Candidate(*pair, gain=1.0, suppression=suppression, score=NO_RESPONSE)
     gain = float(scaled.logit(jnp.asarray(FULL, float))) / level
     u = np.asarray(scaled.expand(jnp.asarray(response.u), gain))
     averaged = ndimage.uniform_filter1d(u, round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
