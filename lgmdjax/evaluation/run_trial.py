@@ -184,12 +184,13 @@ def plot_trial(trial: trials.Trial, rooms: Room, record: Record) -> Figure:
     unmirror = np.stack([np.ones_like(handedness), handedness], axis=1)[:, None]
     positions = np.asarray(record.position)[..., :2] * unmirror
     unmirrored = [arena.mirror(room) if hand < 0 else room for room, hand in zip(arenas, handedness, strict=True)]
-    if not trial.ends_at_contact:
+    outcome = trials.find_outcome(trial, record)
+    if not trial.ends_at_contact or trial.random_rooms:
+        ends = outcome.frames if trial.ends_at_contact else np.full(len(positions), positions.shape[1])
         shown = unmirrored[:MAX_PANELS]
         series = positions, np.asarray(record.resets), np.asarray(record.contact)
-        paths = [trajectories.Paths(*(leaf[[k]] for leaf in series)) for k in range(len(shown))]
+        paths = [trajectories.Paths(*(leaf[[k], : ends[k]] for leaf in series)) for k in range(len(shown))]
         return trajectories.plot_rooms(shown, paths)
-    outcome = trials.find_outcome(trial, record)
     until_end = [path[:end] for path, end in zip(positions, outcome.frames, strict=True)]
     offsets = np.resize(np.repeat(trial.lateral_offsets, 2), len(until_end)) if trial.lateral_offsets else None
     return trajectories.plot_passages(unmirrored, until_end, outcome.touched, outcome.clearance, offsets)

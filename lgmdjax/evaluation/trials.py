@@ -67,6 +67,7 @@ class Trial(NotebookTable):
     beyond: float = np.inf  # m; a robot with a greater x has passed the obstacle
     lateral_offsets: tuple[float, ...] = ()  # m, of the obstacle; every seed has each of them to the left and the right
     ends_at_contact: bool = True  # otherwise the robot is reset and walks on
+    random_rooms: bool = False  # every robot has obstacles of its own
     keeps_heading: bool = False  # the robot has a compass and returns to its first heading (`control.compass`)
 
 
@@ -228,6 +229,7 @@ TRIALS: dict[str, Trial] = {
             make_rooms=room_batches.random_rooms,
             seeds=64,
             seconds=180.0,
+            random_rooms=True,
             ends_at_contact=False,
         ),
         Trial(
@@ -288,6 +290,7 @@ TRIALS: dict[str, Trial] = {
             seeds=40,
             seconds=300.0,
             beyond=TRAVERSE_END,
+            random_rooms=True,
             keeps_heading=True,
         ),
         Trial(
