@@ -216,8 +216,6 @@ def test_distances_to_the_nearest_points_match_the_clearance():
 
 
 def test_capsules_match_the_collision_shapes_and_the_lengths_of_the_legs():
-    names = [hexapod.load().geom(index).name for index in hexapod._anatomy().capsules]
-    assert tuple(names) == hexapod.CAPSULES
     starts, ends, radii = contacts.collision_capsules(np.array([[0, 0, 0.1, 1, 0, 0, 0, *hexapod.stance().ravel()]]))
     assert starts.shape == ends.shape == (1, 13, 2)
     body = limbs()
