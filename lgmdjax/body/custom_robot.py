@@ -27,7 +27,7 @@ from lgmdjax.body.canonical_mjcf import Measured, Stance
 from lgmdjax.body.leg_frames import LegFrames, Source
 from lgmdjax.body.robot_description import Description
 from lgmdjax.body.robot_xml import JOINTS, LEGS, Body
-from lgmdjax.errors import InputError, one_line
+from lgmdjax.errors import one_line
 from lgmdjax.locomotion import kinematics
 from lgmdjax.locomotion.tripod_gait import Gait
 from lgmdjax.runtime import checksums
@@ -51,15 +51,14 @@ def read(path: Path) -> CustomRobot:
     source, legs = six_legs.measure(_open(description))
     robot = robot_parts.measure(source, legs)
     draft = Stance(Gait(), robot_xml.stance(), 0.1)
-    geometry = kinematics.read_geometry(_compile(description, canonical_mjcf.write(robot, draft)))
+    geometry = kinematics.read_geometry(_write(description, robot, draft)[1])
     gait = _choose_gait(source, legs, geometry)
-    angles = stance_check.check_gait(
-        description, geometry, gait, np.stack([servo.set_points for servo in robot.servos])
-    )
+    set_points = np.stack([servo.set_points for servo in robot.servos])
+    angles = stance_check.check_gait(description, geometry, gait, set_points)
     stance = Stance(gait, angles, float(gait.body_height) + float(geometry.foot_radius))
-    model = _compile(description, canonical_mjcf.write(robot, stance))
-    stance = stance._replace(height=stance_check.settle(description, model))
-    body = Body(canonical_mjcf.write(robot, stance))
+    settled = stance_check.settle(description, _write(description, robot, stance)[1])
+    stance = stance._replace(height=settled)
+    body, _ = _write(description, robot, stance)
     return CustomRobot(path.stem, _digest(source), body, _facts(description, robot, stance))
 
 
@@ -84,7 +83,10 @@ def _open(description: Description) -> Source:
     if [model.jnt_type[joint] for joint in joints] != [mujoco.mjtJoint.mjJNT_FREE]:
         raise description.error("trunk", "a body with a free joint", f"{description.trunk}", "add <freejoint/> to it")
     for name, angle in description.locked.items():
-        data.qpos[model.jnt_qposadr[source.find("joint", name, "locked")]] = angle
+        joint = source.find("joint", name, "locked")
+        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise description.error("locked", "hinges", f"{name}, which is none", "remove the joint from the MJCF")
+        data.qpos[model.jnt_qposadr[joint]] = angle
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     c, s = np.cos(description.forward), np.sin(description.forward)
@@ -129,13 +131,14 @@ def _package_posture(legs: Sequence[LegFrames]) -> tuple[Float[np.ndarray, "3 2"
     return feet, float(-np.mean(mounts[:, 2] + rise))
 
 
-def _compile(description: Description, text: str) -> mujoco.MjModel:
+def _write(description: Description, robot: Measured, stance: Stance) -> tuple[Body, mujoco.MjModel]:
+    """Return the body of a robot, and its model."""
     try:
-        return mujoco.MjModel.from_xml_string(text)
+        body = Body(canonical_mjcf.write(robot, stance))
+        return body, robot_xml.load(body)
     except ValueError as error:
-        raise InputError(
-            f"{description.path}: expected masses and sizes that MuJoCo accepts, got {one_line(error)}; "
-            "correct the MJCF"
+        raise description.error(
+            "mjcf", "masses and sizes that MuJoCo accepts", one_line(error), "correct the MJCF"
         ) from None
 
 

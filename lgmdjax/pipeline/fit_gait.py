@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
 from lgmdjax.body import hexapod, robot_xml
+from lgmdjax.errors import InputError
 from lgmdjax.evaluation import gait_test
 from lgmdjax.evaluation.gait_test import GaitTrajectory
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, shaping, tripod_gait
@@ -35,6 +36,7 @@ SWEEP_COMMANDS = (
 )  # v left, right
 PLOTTED_COMMANDS = ((0.5, 0.5), (1.0, 1.0), (2.0, 2.0))  # fig. 5c
 STRAIGHT = (1.0, 1.0)
+MIN_SPEED = 0.5  # of that asked for, below which a robot of one's own has no gait
 
 
 class Condition(NamedTuple):
@@ -73,7 +75,9 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: FitGaitSettings, see
         condition: {"mjx": walk, "c": gait_test.simulate_mujoco(body, own)}
         for (condition, own), walk in zip(targets.items(), in_mjx, strict=True)
     }
-    write_json(folder / "gait.json", _summary(walks, float(cpg_params.cycle_time)))
+    summary = _summary(walks, float(cpg_params.cycle_time))
+    _report(summary, settings, is_own="robot" in inputs)
+    write_json(folder / "gait.json", summary)
     write_arrays(folder / "foot.npz", _foot_paths(body, targets, walks, float(cpg_params.cycle_time)))
 
 
@@ -149,6 +153,18 @@ def _summary(walks: Walks, cycle: float) -> JsonObject:
         "literal": {simulator: gait.speed for simulator, gait in printed.items()},
         "sway": sway | {"bounce_mm": 1000 * straight.heave},
     }
+
+
+def _report(summary: JsonObject, settings: FitGaitSettings, *, is_own: bool) -> None:
+    """Print how the robot walks straight on; raise `InputError` for a robot of one's own that hardly does."""
+    row = next(row for row in summary["sweep"] if row["velocity"] == list(STRAIGHT))
+    walks = f"{row['mjx']:.3f} m/s in MJX, {row['c']:.3f} m/s in C MuJoCo"
+    print(f"fit-gait: walks at {walks}; turns by {row['drift_deg']:.1f} deg in {settings.seconds:g} s", flush=True)
+    if is_own and not min(row["mjx"], row["c"]) > MIN_SPEED * row["asked"]:
+        raise InputError(
+            f"fit-gait: expected a gait of {row['asked']:g} m/s, got {walks}; check gains and torque limits of the "
+            "servos, give the robot another key frame `stance`, or fit for longer (--fit-gait.steps)"
+        )
 
 
 def _foot_paths(body: mujoco.MjModel, targets: Targets, walks: Walks, cycle: float) -> dict[str, np.ndarray]:

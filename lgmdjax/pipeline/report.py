@@ -156,12 +156,12 @@ def _names() -> JsonObject:
 
 
 def _robot_size(body: Body | None) -> dict[str, float]:
-    """Measure length and width of the standing robot's visible parts [m]."""
+    """Measure length and width of the standing robot's visible parts, and the distance of its eyes [m]."""
     stance = robot_xml.compiled(body).key("stance").qpos
-    starts, ends, _, _, radii, _ = walk_video.body_geometry(stance[None], body)
+    starts, ends, eyes, _, radii, _ = walk_video.body_geometry(stance[None], body)
     tips, thick = np.stack([starts[0], ends[0]]), radii[:, None]
     length, width, _ = np.max(tips + thick, axis=(0, 1)) - np.min(tips - thick, axis=(0, 1))
-    return {"length": float(length), "width": float(width)}
+    return {"length": float(length), "width": float(width), "eyes": float(np.linalg.norm(eyes[0, 0] - eyes[0, 1]))}
 
 
 def _number(value: float, digits: int = 3) -> str:
