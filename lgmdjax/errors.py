@@ -2,7 +2,13 @@
 
 
 class InputError(ValueError):
-    """Invalid input from the user; the message is one line: what was expected, what was given, and what to do."""
+    """Invalid input from the user: what was expected, what was given, and what to do.
+
+    The message is made one printable line, since it may quote the content of a file.
+    """
+
+    def __init__(self, message: str):
+        super().__init__(one_line(message))
 
 
 def one_line(text: object) -> str:

@@ -11,6 +11,7 @@ from . import hardware_flags as hardware_flags
 from . import main as main
 from . import servos as servos
 from . import sim_robot as sim_robot
+from . import streams as streams
 from . import study as study
 from . import sweep as sweep
 from . import tracking as tracking

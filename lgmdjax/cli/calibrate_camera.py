@@ -21,9 +21,16 @@ def calibrate(flags: CalibrateCameraFlags) -> Iterator[str]:
         raise InputError(
             f"expected a folder with pictures of a chessboard, got {flags.folder}, which is not a folder; give another"
         )
+    plot = flags.out.with_suffix(".png")
+    if plot.parent.resolve() == flags.folder.resolve():
+        raise InputError(
+            f"expected --out outside of {flags.folder}, where its plot would be taken for a picture, got {flags.out}; "
+            "choose another folder"
+        )
     board = chessboard.parse_board(flags.board, flags.square)
+    partial_files.require_writable(flags.out.parent)
     found = chessboard.calibrate(flags.folder, board, flags.model)
-    with partial_files.replacing(flags.out.with_suffix(".png")) as partial:
+    with partial_files.replacing(plot) as partial:
         partial.write_bytes(style.to_png(chessboard.plot(found)))
     lens.write(flags.out, found.lens)
     left = np.rad2deg(chessboard.row_deviations(found))
@@ -32,4 +39,4 @@ def calibrate(flags: CalibrateCameraFlags) -> Iterator[str]:
     mean = np.sqrt(np.mean(left**2))
     yield f"rows of corners bend by {mean:.3f} degrees (root mean square), {np.abs(left).max():.3f} at most"
     yield str(flags.out)
-    yield str(flags.out.with_suffix(".png"))
+    yield str(plot)

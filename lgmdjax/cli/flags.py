@@ -31,6 +31,7 @@ from lgmdjax.evaluation.settings import BenchScale, TrialName, TrialPlan
 from lgmdjax.pipeline import scales
 from lgmdjax.pipeline.scales import Scale
 from lgmdjax.pipeline.settings import EvaluateSettings
+from lgmdjax.runtime import seeds
 
 FlagsT = TypeVar("FlagsT")
 MAX_NAME = 200  # characters of the name that a run folder gets from its changed settings
@@ -297,13 +298,13 @@ def parse_study(study: str, question: str, arguments: Sequence[str]) -> StudyFla
 
 
 def parse(flags: FlagsT, command: str, description: str, arguments: Sequence[str]) -> FlagsT:
-    """Read flags; those that are not given keep the values of `flags`."""
+    """Read flags; those that are not given keep the values of `flags`. Raises InputError for an impossible --seed."""
     for before, argument in zip(("", *arguments), arguments, strict=False):
         flag, equals, value = argument.partition("=")
         if not (value if equals else argument) and "--name" not in (before, flag):
             named = flag if equals else before or "the first argument"
             raise InputError(f"expected a value for {named}, got an empty one; leave it out, or give a path")
-    return tyro.cli(
+    given = tyro.cli(
         type(flags),
         default=flags,
         prog=f"lgmdjax {command}",
@@ -312,6 +313,8 @@ def parse(flags: FlagsT, command: str, description: str, arguments: Sequence[str
         config=(tyro.conf.AvoidSubcommands,),
         registry=_REGISTRY,
     )
+    seeds.check(getattr(given, "seed", 0))
+    return given
 
 
 def parse_trial(description: str, arguments: Sequence[str]) -> TrialFlags:

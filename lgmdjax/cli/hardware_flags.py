@@ -110,8 +110,7 @@ def parse_drive(description: str, arguments: Sequence[str]) -> DriveFlags:
         raise InputError(f"expected a --calibration for each eye, or one for both, got {len(given.calibration)}")
     if given.mono and len(given.camera) == 2:
         raise InputError("expected one --camera with --mono, got two; leave one out")
-    if given.seconds is not None and not given.seconds > 0:
-        raise InputError(f"expected --seconds above 0, got {given.seconds:g}; leave it out to walk until Ctrl-C")
+    _check_seconds(given.seconds)
     return given
 
 
@@ -120,6 +119,7 @@ def parse_sim_robot(description: str, arguments: Sequence[str]) -> SimRobotFlags
     given = flags.parse(SimRobotFlags(), "sim-robot", description, arguments)
     if not 0 <= given.port < 65536:
         raise InputError(f"expected a --port of 0 to 65535, got {given.port}; 0 takes any free one")
+    _check_seconds(given.seconds)
     return given
 
 
@@ -134,3 +134,8 @@ def parse_servos_map(description: str, arguments: Sequence[str]) -> ServosMapFla
     if not 0 <= given.highest_id <= 252:
         raise InputError(f"expected --highest-id of 0 to 252, got {given.highest_id}; servos are numbered from 1")
     return given
+
+
+def _check_seconds(seconds: float | None) -> None:
+    if seconds is not None and not seconds > 0:
+        raise InputError(f"expected --seconds above 0, got {seconds:g}; leave it out to run until Ctrl-C")

@@ -6,19 +6,16 @@ the command that needs them: `lgmdjax --help` loads neither tyro nor JAX, and th
 """
 
 import argparse
-import codecs
-import contextlib
-import io
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import getdoc
 from pathlib import Path
 from typing import IO
 
 from lgmdjax import __version__
-from lgmdjax.cli import environment
+from lgmdjax.cli import environment, streams
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import collect_garbage_rarely, prepare_jax, prepare_opengl
@@ -283,17 +280,20 @@ def exit_code(command: Callable[[], int | None], afterwards: str = RESUMES) -> i
     """
     interrupted = f"lgmdjax: interrupted; {afterwards}"
     try:
-        with _writable_output(), interruption.handling_signals(interrupted):
+        with streams.writable(), interruption.handling_signals(interrupted):
             return command() or 0
-    except (InputError, OSError) as error:
-        return _complain(f"lgmdjax: {one_line(error)}", 2)
+    except OSError as error:
+        return streams.complain(f"lgmdjax: {one_line(streams.explain_full_disk(error) or error)}", 2)
+    except InputError as error:
+        return streams.complain(f"lgmdjax: {error}", 2)
     except MemoryError as error:
-        return _complain(f"lgmdjax: expected more memory, got {one_line(error) or 'none'}; run fewer robots at once", 2)
+        reason = one_line(error) or "none"
+        return streams.complain(f"lgmdjax: expected more memory, got {reason}; run fewer robots at once", 2)
     except KeyboardInterrupt as error:
-        return _complain(interrupted, error.exit_code if isinstance(error, interruption.Interrupted) else 130)
+        return streams.complain(interrupted, error.exit_code if isinstance(error, interruption.Interrupted) else 130)
     except Exception as error:
         if fault := environment.explain(error):
-            return _complain(f"lgmdjax: {one_line(fault)}", 2)
+            return streams.complain(f"lgmdjax: {one_line(fault)}", 2)
         raise
 
 
@@ -307,41 +307,6 @@ def _run(given: Sequence[str]) -> int | None:
     prepare_jax()
     collect_garbage_rarely()
     return COMMANDS[name](given[1:])
-
-
-@contextlib.contextmanager
-def _writable_output() -> Iterator[None]:
-    """Make every text printable in any encoding; raise `OSError` at the end if output cannot be written.
-
-    File names that are not valid in the encoding of stdout are printed as their original bytes.
-    """
-    codecs.register_error("lgmdjax-names", _replace_by_bytes)
-    for stream, errors in ((sys.stdout, "lgmdjax-names"), (sys.stderr, "backslashreplace")):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors=errors)
-    try:
-        yield
-    finally:
-        try:
-            sys.stdout.flush()
-        except OSError:
-            with contextlib.suppress(OSError):  # when Python exits, printing the rest must not fail again
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise
-
-
-def _replace_by_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
-    try:
-        return codecs.lookup_error("surrogateescape")(error)
-    except UnicodeError:
-        return codecs.backslashreplace_errors(error)
-
-
-def _complain(line: str, code: int) -> int:
-    """Print a line on stderr, if anybody can read it, and return an exit code."""
-    with contextlib.suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
-    return code
 
 
 class _Parser(argparse.ArgumentParser):

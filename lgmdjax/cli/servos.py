@@ -7,6 +7,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.hardware import joint_map, servo_mapping
 from lgmdjax.hardware.clock import Clock
 from lgmdjax.hardware.servo_bus import BusLost, ServoBus
+from lgmdjax.runtime import partial_files
 
 
 def map_servos(flags: ServosMapFlags) -> None:
@@ -15,6 +16,7 @@ def map_servos(flags: ServosMapFlags) -> None:
         raise InputError(
             f"expected a new file for the joint map, got {flags.out}, which exists; name another with --out"
         )
+    partial_files.require_writable(flags.out.parent)  # before eighteen questions are asked
     clock = Clock(flags.speed)
     with ServoBus(flags.servos, flags.baud, clock) as bus:
         try:

@@ -8,14 +8,18 @@
 | zarr    | a Zarr group, version 3                       | `lgmdjax.datasets.zarr_arrays`  | without loss   |
 """
 
+import re
 from pathlib import Path
 
 import jax
 
 from lgmdjax.datasets import card, lerobot, pictures, recorded, tables, zarr_arrays
 from lgmdjax.datasets.formats import DATASET_FORMATS, WITH_PICTURES, DatasetFormat
-from lgmdjax.errors import InputError
+from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import partial_files
+
+LICENCE = re.compile(r"[A-Za-z0-9.+-]+( (AND|OR|WITH) [A-Za-z0-9.+-]+)*")
+"""Identifiers of the SPDX list, and simple expressions of them."""
 
 
 def export(
@@ -41,7 +45,10 @@ def export(
         raise InputError(f"expected a format of {', '.join(DATASET_FORMATS)}, got {format!r}; choose one of these")
     if video and format not in WITH_PICTURES:
         raise InputError(f"expected --video with format {' or '.join(WITH_PICTURES)}, got {format}; leave --video out")
+    if not LICENCE.fullmatch(licence):
+        raise InputError(f"expected a licence such as {card.LICENCE}, got {licence!r}; see spdx.org/licenses")
     partial_files.require_empty(out)
+    partial_files.require_utf8(out)
     recording = recorded.read(run)
     with jax.enable_x64(False), partial_files.new_folder(out) as folder:  # pictures in single precision, as the robot's
         eyes = pictures.find_camera(recording) if video else None
@@ -53,6 +60,6 @@ def export(
             tables.write_csv(folder, recording)
         else:
             tables.write_parquet(folder, recording)
-        text = card.describe(recording, run.resolve().name, format, eyes, licence)
+        text = card.describe(recording, one_line(run.resolve().name), format, eyes, licence)
         (folder / card.FILE).write_text(text, encoding="utf-8")
     return sorted(path for path in out.rglob("*") if path.is_file())

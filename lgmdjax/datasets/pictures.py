@@ -19,6 +19,7 @@ from lgmdjax.datasets import recorded_rooms
 from lgmdjax.datasets.recorded import Recording
 from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
+from lgmdjax.runtime import schema
 from lgmdjax.sensors import hemifield
 from lgmdjax.sensors.settings import CameraSettings
 from lgmdjax.simulation import assembly, episodes, rerender
@@ -45,7 +46,8 @@ def find_camera(recording: Recording) -> RecordedCamera:
     """Return the camera of a recording: that of its header, of the run that it is in, or of the pretrained robot."""
     parameters = recording.parameters
     if "eyes" in parameters and "lgmd" in parameters:
-        settings = CameraSettings(**parameters["eyes"])
+        schema.check(assembly.HEADER, parameters, f"{recording.folder}: header", "collect again")
+        settings = assembly.read_camera_settings(parameters)
         detector = assembly.fit_detector(assembly.lgmd_params(parameters["lgmd"]), settings)
         return RecordedCamera(settings=settings, detector=detector, body=robot_xml.find_body(recording.folder))
     around = [folder for folder in recording.folder.resolve().parents if (folder / "train").is_dir()]

@@ -17,7 +17,7 @@ from lgmdjax.control import navigator, policies
 from lgmdjax.deployment import nervous_system
 from lgmdjax.deployment.nervous_system import Params
 from lgmdjax.detectors import cells, lgmd
-from lgmdjax.errors import InputError
+from lgmdjax.errors import InputError, one_line
 from lgmdjax.locomotion import cpg, shaping
 from lgmdjax.paths import PACKAGE_DIR
 from lgmdjax.sensors import hemifield
@@ -82,7 +82,7 @@ def generate(params: Params, robot: str) -> dict[str, str]:
     )
     contents = {
         "version": __version__,
-        "robot": robot,
+        "robot": _in_comment(robot),
         "frame_rate": int(FRAME_RATE),
         "sizes": sizes(params),
         "private": private_sizes(params),
@@ -90,6 +90,16 @@ def generate(params: Params, robot: str) -> dict[str, str]:
         "efference": params.controller.policy.variant == "lstm-efference",
     }
     return {name: environment.get_template(f"{name}.j2").render(contents) for name in FILES}
+
+
+def _in_comment(text: str) -> str:
+    """Return a text, which may be any file name, so that it can stand in a comment of an ASCII file.
+
+    >>> _in_comment("für */ elise")
+    'f\\xfcr * / elise'
+    """
+    ascii_text = one_line(text).encode("ascii", "backslashreplace").decode()
+    return ascii_text.replace("*/", "* /").replace("/*", "/ *")
 
 
 def sizes(params: Params) -> dict[str, int]:

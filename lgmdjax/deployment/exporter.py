@@ -18,7 +18,7 @@ from lgmdjax.deployment import c_source, card, nervous_system, onnx_graph, stabl
 from lgmdjax.deployment.formats import FORMATS, PRETRAINED, Format
 from lgmdjax.errors import InputError
 from lgmdjax.paths import PRETRAINED_DIR
-from lgmdjax.runtime import partial_files, storage
+from lgmdjax.runtime import partial_files, schema, storage
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop
 
@@ -107,8 +107,14 @@ def _write_programs(folder: Path, params: nervous_system.Params, robot: str, for
 
 
 def _read_scores(run: Path) -> JsonObject | None:
-    """Return what stage evaluate measured of the learned policy, by trial; None if it did not run."""
+    """Return what stage evaluate measured of the learned policy, by trial; None if it did not run.
+
+    Trials whose plan leaves the learned policy out are left out too.
+    """
     path = run / "evaluate" / "evaluation.json"
     if not path.is_file():
         return None
-    return {trial: by_policy["learned"] for trial, by_policy in storage.read_json(path).items()}
+    trials, remedy = storage.read_json(path), "run `lgmdjax evaluate` again"
+    schema.check(schema.Object(), trials, str(path), remedy)
+    schema.check(schema.Object(dict.fromkeys(trials, schema.Object())), trials, str(path), remedy)
+    return {trial: by_policy["learned"] for trial, by_policy in trials.items() if "learned" in by_policy}

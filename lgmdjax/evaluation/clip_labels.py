@@ -13,6 +13,7 @@ Kinds `collision` and `approach` call for an alarm, with or without a time of co
 
 import csv
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,10 +54,10 @@ def read_labels(path: Path) -> list[Label]:
             labels = [_read_row(row, f"{path}, line {reader.line_num}") for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{expected}, got no such file ({error}); write one, or name another") from error
-    names = [label.clip for label in labels]
-    repeated = {name for name in names if names.count(name) > 1}
-    if repeated or not names:
-        raise InputError(f"{expected}, a row for each clip, got {sorted(repeated) or 'no row'}; correct the rows")
+    repeated = sorted(clip for clip, rows in Counter(label.clip for label in labels).items() if rows > 1)
+    if repeated or not labels:
+        found = f"{repeated[0]} {'and others ' * (len(repeated) > 1)}twice" if repeated else "no row"
+        raise InputError(f"{expected}, a row for each clip, got {found}; correct the rows")
     return labels
 
 
@@ -64,6 +65,8 @@ def _read_row(row: dict[str, str], where: str) -> Label:
     clip, kind, contact = ((row[name] or "").strip() for name in COLUMNS)
     if not clip or not kind:
         raise InputError(f"{where}: expected a clip and its kind, got {clip!r} and {kind!r}; fill both in")
+    if Path(clip).is_absolute() or ".." in Path(clip).parts or "\0" in clip:
+        raise InputError(f"{where}: expected a clip in the folder of the videos, got {clip!r}; move it there")
     try:
         time = float(contact) if contact else None
     except ValueError:

@@ -117,7 +117,7 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "height width"]:
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("L"))
-    except (OSError, ValueError) as error:
+    except Exception as error:  # whatever a damaged file makes Pillow raise
         raise InputError(
             f"expected a picture, got {path} ({one_line(error)[:120]}); remove it from the folder"
         ) from error

@@ -26,7 +26,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lgmdjax.errors import InputError, one_line
-from lgmdjax.runtime import partial_files, versions
+from lgmdjax.runtime import partial_files, schema, versions
 from lgmdjax.runtime.storage import JsonObject
 
 FORMAT, VERSION = "lgmdjax drive", 1
@@ -44,6 +44,9 @@ UNITS: Mapping[str, str] = {
     **{"voltage": "V", "bus_failures": "", "stops": ""},
 }
 """Columns and their units."""
+TEXTS = ("mode", "reason")
+"""Columns of text; all others hold numbers. Both may be null."""
+HEADER = schema.Object({"format": schema.Text((FORMAT,)), "version": schema.Integer(VERSION, VERSION)})
 
 Row = dict[str, float | int | str | None]
 
@@ -58,8 +61,9 @@ class Writer:
 
     def __init__(self, folder: Path, facts: JsonObject):
         partial_files.require_empty(folder)
+        partial_files.require_utf8(folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            partial_files.make_folder(folder)
         except OSError as error:
             raise partial_files.not_writable(folder, error) from error
         self.folder, self._rows, self._chunks = folder, list[Row](), 0
@@ -94,7 +98,7 @@ def _write(path: Path, rows: list[Row], metadata: dict[str, str]) -> None:
     """Write a chunk, whole or not at all."""
     table = pa.table({name: [row.get(name) for row in rows] for name in UNITS}, metadata=metadata)
     with partial_files.replacing(path) as partial:
-        pq.write_table(table, partial, compression="zstd")
+        pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
 
 
 def read(folder: Path) -> pa.Table:
@@ -108,19 +112,39 @@ def read(folder: Path) -> pa.Table:
     files = sorted(folder.glob("drive-*.parquet"))
     if not files:
         raise InputError(f"{folder}: expected the log of a drive, got no drive-*.parquet; `lgmdjax drive` writes one")
-    tables = []
-    for path in files:
-        try:
-            table = pq.read_table(path)
-        except (pa.ArrowException, OSError) as error:
-            raise InputError(
-                f"{path}: expected a whole Parquet file, got {one_line(error)[:200]}; remove it"
-            ) from error
+    tables = [_load(path) for path in files]
+    try:
+        return pa.concat_tables(tables, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise InputError(f"{folder}: expected chunks of one log, got {one_line(error)[:200]}; separate them") from error
+
+
+def _load(path: Path) -> pa.Table:
+    """Return the checked table of a chunk."""
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            if file.metadata.num_rows > CHUNK_ROWS:  # before memory is allocated
+                raise ValueError(f"{file.metadata.num_rows} rows")
+            table = file.read()
         header = json.loads((table.schema.metadata or {}).get(b"lgmdjax", b"{}"))
-        if header.get("format") != FORMAT or header.get("version") != VERSION:
-            raise InputError(f"{path}: expected a drive's log of version {VERSION}, got another kind of file; move it")
-        tables.append(table)
-    return pa.concat_tables(tables, promote_options="permissive")
+    except Exception as error:  # whatever a damaged file makes Arrow and json raise
+        raise InputError(f"{path}: expected a whole Parquet file, got {one_line(error)[:200]}; remove it") from error
+    schema.check(HEADER, header, f"{path}: header of a drive's log", "move it")
+    names = table.column_names
+    if missing := [name for name in UNITS if names.count(name) != 1]:
+        raise InputError(f"{path}: expected every column once, got {names.count(missing[0])} of {missing[0]}; move it")
+    for name in UNITS:
+        found = table[name].type
+        is_expected = pa.types.is_string if name in TEXTS else _is_number
+        if not (is_expected(found) or pa.types.is_null(found)):
+            raise InputError(
+                f"{path}: expected {'text' if name in TEXTS else 'numbers'} in {name}, got {found}; move it"
+            )
+    return table.select(list(UNITS))
+
+
+def _is_number(found: pa.DataType) -> bool:
+    return pa.types.is_integer(found) or pa.types.is_float32(found) or pa.types.is_float64(found)
 
 
 def joints(table: pa.Table, name: str) -> np.ndarray:

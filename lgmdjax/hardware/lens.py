@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lgmdjax.errors import InputError, one_line
-from lgmdjax.runtime import partial_files, storage
+from lgmdjax.runtime import partial_files, schema, storage
 
 if HAS_OPENCV := find_spec("cv2") is not None:
     import cv2
@@ -41,7 +41,8 @@ NAMES = {
 }
 WIDTHS, HEIGHTS = ("image_width", "image_Width", "width"), ("image_height", "image_Height", "height")
 MODELS = {"equidistant": "fisheye", "plumb_bob": "pinhole", "rational_polynomial": "pinhole"}  # of ROS
-MAX_PIXELS = 16384
+SIDE = schema.Number(1, 16384)  # px; YAML has floats
+MAX_NUMBER = 1e6  # in K and D: far beyond those of any lens
 REMEDY = "make one with `lgmdjax calibrate-camera`"
 
 
@@ -157,9 +158,11 @@ def read(path: Path) -> Lens:
             f"{path}: expected D, {numbers} numbers for {model}, got {one_line(found['D'])[:80]}; {REMEDY}"
         )
     K = matrix.reshape(3, 3)
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and 0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1]):
+    has_form = K[1, 0] == 0 and np.array_equal(K[2], [0, 0, 1])
+    if not (has_form and K[0, 0] > 0 and K[1, 1] > 0 and 0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1]):
         raise InputError(
-            f"{path}: expected K with focal lengths above 0 and its centre in the picture, got others; {REMEDY}"
+            f"{path}: expected K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with focal lengths above 0 and its centre in "
+            f"the picture, got {one_line(found['K'])[:80]}; {REMEDY}"
         )
     return Lens(model=model, size=size, K=K, D=distortion.reshape(-1))
 
@@ -168,6 +171,10 @@ def _parse(path: Path, text: str) -> Mapping[str, object]:
     """Return the fields of a file in JSON or in OpenCV's YAML."""
     try:
         content = json.loads(text)
+    except RecursionError as error:
+        raise InputError(
+            f"{path}: expected an object with model, size, K and D, got JSON too deep; {REMEDY}"
+        ) from error
     except ValueError:
         content = _parse_yaml(path, text)
     if not isinstance(content, Mapping):
@@ -185,7 +192,7 @@ def _parse_yaml(path: Path, text: str) -> Mapping[str, object]:
         file = cv2.FileStorage(header + text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = file.root()
         return {name: _from_node(root.getNode(name)) for name in root.keys()}  # noqa: SIM118 (not a mapping)
-    except cv2.error as error:
+    except Exception as error:  # OpenCV's own, SystemError, and those of text that is not UTF-8
         raise InputError(f"{path}: expected JSON or YAML, got {one_line(error)[:120]}; {REMEDY}") from error
 
 
@@ -210,9 +217,9 @@ def _array(value: object) -> Float[np.ndarray, "..."] | None:
     numbers = value.get("data") if isinstance(value, Mapping) else value
     try:
         array = np.asarray(numbers, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
-    return array if array.ndim and np.isfinite(array).all() else None
+    return array if array.ndim and np.all(np.abs(array) <= MAX_NUMBER) else None
 
 
 def _model(content: Mapping[str, object], path: Path) -> Model:
@@ -227,7 +234,7 @@ def _model(content: Mapping[str, object], path: Path) -> Model:
 def _size(content: Mapping[str, object], path: Path) -> tuple[int, int]:
     both = _find(content, "size", "image_size", "img_shape")
     sides = both if isinstance(both, list) else [_find(content, *WIDTHS), _find(content, *HEIGHTS)]
-    whole = [int(side) for side in sides if isinstance(side, (int, float)) and side == int(side)]
-    if len(whole) != 2 or not all(0 < side <= MAX_PIXELS for side in whole):
+    if len(sides) != 2 or not all(SIDE.accepts(side) and side == int(side) for side in sides):
         raise InputError(f"{path}: expected size, width and height in px, got {one_line(sides)[:80]}; {REMEDY}")
-    return whole[0], whole[1]
+    width, height = map(int, sides)
+    return width, height

@@ -9,7 +9,7 @@ are dimmed.
 """
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -275,11 +275,11 @@ def _render(
 ) -> Iterator[tuple[UInt8[ndarray, "height width 3"], UInt8[ndarray, "2 rows columns"]]]:
     """Render the views in chunks of one size, two at a time; the last chunk is padded."""
     count = len(views.time)
-    render = _renderer(third_person.Params(), replace(eyes, overlap=1.0, ground=0.0))
+    params, whole = third_person.Params(), replace(eyes, overlap=1.0, ground=0.0)
 
     def render_chunk(first: int) -> tuple[ndarray, ndarray]:
         rows = np.minimum(np.arange(first, first + IMAGES_PER_CALL), count - 1)
-        view, eye_images = render(jax.tree.map(lambda leaf: leaf[rows], views), robot)
+        view, eye_images = _render_views(jax.tree.map(lambda leaf: leaf[rows], views), robot, params=params, eyes=whole)
         return np.asarray(view)[: count - first], np.asarray(eye_images)[: count - first]
 
     with ThreadPoolExecutor(2) as pool:
@@ -287,12 +287,13 @@ def _render(
             yield from zip(view, eye_images, strict=True)
 
 
-def _renderer(
-    params: third_person.Params, eyes: camera.Params
-) -> Callable[[_Views, RobotCapsules], tuple[Array, Array]]:
-    """Compile the rendering of a chunk: third-person images (n, h, w, 3) and images of both eyes (n, 2, h, w)."""
+@partial(jax.jit, static_argnames=("params", "eyes"))
+def _render_views(
+    views: _Views, robot: RobotCapsules, *, params: third_person.Params, eyes: camera.Params
+) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n 2 rows columns"]]:
+    """Render a chunk: third-person images, and images of both eyes. All videos share one program."""
 
-    def render(robot: RobotCapsules, view: _Views) -> tuple[Array, Array]:
+    def render(view: _Views) -> tuple[Array, Array]:
         scene = arena.at_time(view.room, view.time)
         posed = robot._replace(starts=view.starts, ends=view.ends)
         viewpoint = Viewpoint(view.camera_position, view.camera_rotation)
@@ -300,7 +301,7 @@ def _renderer(
         eye_images = camera.render(eyes, scene, view.eye_positions, view.eye_rotations)
         return (255 * image).astype(jnp.uint8), jnp.clip(eye_images, 0, 255).astype(jnp.uint8)
 
-    return jax.jit(lambda views, robot: jax.lax.map(partial(render, robot), views))
+    return jax.lax.map(render, views)
 
 
 class _Page:

@@ -9,6 +9,7 @@ from . import program_cache as program_cache
 from . import pytree_json as pytree_json
 from . import run_folders as run_folders
 from . import schema as schema
+from . import seeds as seeds
 from . import static_arguments as static_arguments
 from . import storage as storage
 from . import tracking as tracking

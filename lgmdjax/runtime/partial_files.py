@@ -8,6 +8,7 @@ import contextlib
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,12 +42,18 @@ def replacing_all(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder; at the end of the block its files move into `folder`, which is created if missing.
 
     A block that raises leaves `folder` as it was. Temporary folders that killed processes left there are removed; those
-    of running processes are not.
+    of running processes are not. Raises `InputError` if a folder has the name of a file.
     """
     with _working_folder(folder, remove_empty=True) as work:
         yield work
-        for file in work.iterdir():
-            sync(file)
+        files = sorted(work.iterdir())
+        for file in files:
+            if (folder / file.name).is_dir():
+                raise InputError(
+                    f"expected {folder / file.name} to be a file, got a folder; move it, or choose another"
+                )
+        sync_all(work)
+        for file in files:
             os.replace(file, folder / file.name)
         sync(folder)
 
@@ -70,10 +77,9 @@ def new_folder(folder: Path) -> Iterator[Path]:
     with _working_folder(folder.parent) as work:
         yield work
         require_empty(folder)
+        sync_all(work)
         if folder.exists():
             folder.rmdir()
-        for file in work.iterdir():
-            sync(file)
         os.replace(work, folder)
         sync(folder.parent)
 
@@ -89,7 +95,7 @@ def _working_folder(parent: Path, *, remove_empty: bool = False) -> Iterator[Pat
         remove_empty: remove `parent` too, if it is empty at the end.
     """
     try:
-        parent.mkdir(parents=True, exist_ok=True)
+        make_folder(parent)
         _remove_abandoned_folders(parent)
         work = parent / f"{checksums.PARTIAL}-{secrets.token_hex(8)}"
         lock = FileLock(_lock_of(work)).acquire()  # before the folder: a folder without a lock is abandoned
@@ -130,6 +136,39 @@ def sync(path: Path) -> None:
     else:
         with path.open("rb+") as file:  # for writing, as Windows requires
             os.fsync(file.fileno())
+
+
+def require_utf8(folder: Path) -> None:
+    """Raise `InputError` for a path that is not UTF-8, which Arrow and TensorStore cannot write to."""
+    try:
+        str(folder.absolute()).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"expected a folder with a name in UTF-8, got {folder.absolute()}; choose another") from None
+
+
+def require_writable(folder: Path) -> None:
+    """Make a folder if it is missing; raise `InputError` unless files can be written into it."""
+    try:
+        make_folder(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise not_writable(folder, error) from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, unless they exist; wait until their names are on the disk."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in missing:
+        sync(path.parent)
+
+
+def sync_all(folder: Path) -> None:
+    """Wait until a folder is on the disk, with all files and folders in it."""
+    for path in folder.rglob("*"):
+        sync(path)
+    sync(folder)
 
 
 def _lock_of(folder: Path) -> Path:

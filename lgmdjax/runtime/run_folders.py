@@ -32,12 +32,11 @@ from filelock import FileLock, Timeout
 
 from lgmdjax import __version__
 from lgmdjax.errors import InputError, one_line
-from lgmdjax.runtime import checksums, compiled_code, partial_files, schema, storage, versions
+from lgmdjax.runtime import checksums, compiled_code, partial_files, schema, seeds, storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
 FORMAT = 2  # of the run folder; no stage is resumed in a folder of another format
 ABSENT = "none"  # in messages, in place of a setting that only one of two runs has
-SEED_LIMIT = 2**32  # in single precision JAX keeps the last 32 bits of a seed: greater seeds would repeat smaller ones
 
 StageFunction = Callable[[Path, Mapping[str, Path], Any, int], None]
 """Function of a stage: `run(folder, inputs, settings, seed)`.
@@ -77,12 +76,12 @@ def open_run(
     """
     if name in ("", ".", "..") or Path(name).name != name or not name.isprintable():
         raise InputError(f"expected a plain folder name for the run, got {name!r}; use --out for the path")
-    if not 0 <= seed < SEED_LIMIT:
-        raise InputError(f"expected a seed of 0 to {SEED_LIMIT - 1}, got {seed}; choose another --seed")
+    seeds.check(seed)
     run = Run(folder=out / name, seed=seed, settings=settings, remedy=remedy)
+    partial_files.require_utf8(run.folder)
     requested = {"format": FORMAT, "scale": scale, "seed": seed, "settings": _to_json(settings)}
     try:
-        run.folder.mkdir(parents=True, exist_ok=True)
+        partial_files.make_folder(run.folder)
         if not (run.folder / "run.json").exists():
             with _locked(run):
                 facts = checksums.add_checksum(requested | {"versions": versions.installed()})
@@ -232,7 +231,7 @@ def _to_json(settings: object) -> object:
     return json.loads(json.dumps(settings))
 
 
-SEED = schema.Integer(0, SEED_LIMIT - 1)
+SEED = schema.Integer(0, seeds.LIMIT - 1)
 RUN_FACTS = schema.Object({"format": schema.Integer(1, 1000), "settings": schema.Object()}, {"seed": SEED})
 """Schema of run.json in every format."""
 PRESENT_FACTS = schema.Object({"scale": schema.Text(), "seed": SEED, "versions": schema.Object()})

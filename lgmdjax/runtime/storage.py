@@ -28,7 +28,7 @@ from safetensors.numpy import save as serialise
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.paths import PACKAGE_DIR
 from lgmdjax.runtime import checksums, schema
-from lgmdjax.runtime.partial_files import replacing, sync
+from lgmdjax.runtime.partial_files import replacing, sync_all
 
 JsonObject = dict[str, Any]
 """A JSON object: a row of a study, a file's header."""
@@ -52,9 +52,7 @@ def write_json(path: Path, content: object) -> None:
 
 def write_stamp(folder: Path, facts: JsonObject) -> None:
     """Write the done.json of a folder: some facts, and the checksums of all files, which are synced first."""
-    for path in sorted(folder.rglob("*")):
-        sync(path)
-    sync(folder)
+    sync_all(folder)
     write_json(folder / checksums.STAMP, checksums.add_checksum({**facts, "files": checksums.list_files(folder)}))
 
 

@@ -3,7 +3,7 @@
 from pkgutil import resolve_name
 from typing import Any
 
-from lgmdjax.errors import InputError, one_line
+from lgmdjax.errors import InputError
 
 
 def find(name: str, expected: str) -> Any:
@@ -18,5 +18,6 @@ def find(name: str, expected: str) -> Any:
         raise InputError(f"{expected}, got {name}; choose one")
     try:
         return resolve_name(name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"{expected}, got {name} ({one_line(error)}); is its folder on PYTHONPATH?") from error
+    except Exception as error:  # also whatever the module does when it is imported
+        reason = f"{type(error).__name__}: {error}"[:300]
+        raise InputError(f"{expected}, got {name} ({reason}); is its folder on PYTHONPATH?") from error

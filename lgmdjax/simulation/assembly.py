@@ -65,10 +65,15 @@ def camera_settings(robot: closed_loop.Params) -> CameraSettings:
     return CameraSettings(**of_camera, **of_detector)
 
 
-def read_camera_settings(header: JsonObject) -> CameraSettings:
-    """Return the camera of a controller's training, or of recorded walks, from their header."""
+def read_camera_settings(header: JsonObject, place: str = "header") -> CameraSettings:
+    """Return the camera of a controller's training, or of recorded walks, from their header.
+
+    Raises InputError for impossible ones, with `place` in the message.
+    """
     eyes = header["eyes"]
-    schema.check(EYES, eyes, "header: eyes", "collect and train again")
+    schema.check(EYES, eyes, f"{place}: eyes", "collect and train again")
+    smallest = min(eyes["width"], eyes["height"])
+    schema.check(schema.Integer(1, smallest), eyes.get("pooling", 1), f"{place}: pooling", "train again")
     return CameraSettings(**{name: eyes[name] for name in (*EYES.fields, *EYES.optional) if name in eyes})
 
 
@@ -107,9 +112,8 @@ def load_robot(gait_folder: Path = PRETRAINED_DIR, train_folder: Path = PRETRAIN
     arrays = read_arrays(baselines)
     schema.check(BASELINES, arrays, str(baselines), "train again")
     switch = make_policies(navigator_params, float(arrays["gain"]), arrays["replayed"])
-    smallest = min(header["eyes"]["width"], header["eyes"]["height"])
-    schema.check(schema.Integer(1, smallest), header["eyes"].get("pooling", 1), f"{controller}: pooling", "train again")
-    return assemble_robot(gait_folder, read_camera_settings(header), lgmd_params(header["lgmd"]), switch)
+    settings = read_camera_settings(header, str(controller))
+    return assemble_robot(gait_folder, settings, lgmd_params(header["lgmd"]), switch)
 
 
 def assemble(

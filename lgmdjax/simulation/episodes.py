@@ -94,8 +94,9 @@ class Writer:
         except (TypeError, ValueError, RecursionError) as error:
             raise InputError(f"episodes parameters: expected JSON values, got {error}; convert them") from error
         schema.check(schema.Object(), self.parameters, "episodes parameters", "name them")
+        partial_files.require_utf8(self.folder)
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            partial_files.make_folder(self.folder)
             partial_files.remove_partial_files(self.folder)
         except OSError as error:
             raise InputError(f"{folder}: expected a folder to write to, got {error}; choose another") from error

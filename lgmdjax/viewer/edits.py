@@ -77,9 +77,11 @@ def read_edits(live: JsonObject, frames: int, path: Path) -> tuple[arena.Arena, 
         leaves = [np.asarray(row, float).reshape(shape) for row, shape in zip(live["arena"], shapes, strict=True)]
         room = jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(leaf) for leaf in leaves])
         centres = np.repeat(centres_of(room)[None], frames, axis=0)
-        for frame, index, x, y in live["moves"]:
+        for frame, index, x, y in np.asarray(live["moves"], float).reshape(-1, 4):
+            if not (0 <= frame < frames and 0 <= index < centres.shape[1] and np.isfinite([x, y]).all()):
+                raise ValueError(f"an obstacle {index:g} in frame {frame:g}")
             centres[int(frame) :, int(index)] = x, y
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: expected a walk that the viewer recorded, got {error}; record it again") from error
     return arena.validate(room), centres
 

@@ -13,7 +13,7 @@ def find_walks(path: Path) -> tuple[Path, set[int] | None]:
     if path.is_file():
         if path.suffix != ".parquet":
             raise InputError(f"expected a run, a trial or a chunk-*.parquet, got {path}; `lgmdjax trial` makes one")
-        if path.name.startswith("chunk-") and path.stem[6:].isdigit():
+        if path.name.startswith("chunk-") and path.stem[6:].isdecimal():
             return path.parent, {int(path.stem[6:])}
         raise InputError(f"{path}: expected the name chunk-00000.parquet that it was recorded with; rename it")
     if not path.exists():

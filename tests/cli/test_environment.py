@@ -1,5 +1,6 @@
 """Environments in which a library does not start, and terminals that cannot show everything, end in one line."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -92,6 +93,38 @@ def test_names_that_the_terminal_cannot_show_are_escaped() -> None:
 def test_output_that_cannot_be_written_is_one_line(arguments: list[str]) -> None:
     with open("/dev/full", "w") as full:
         refused(command(*arguments, stdout=full.fileno()), "No space left on device")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs a shell that closes streams")
+@pytest.mark.parametrize(
+    ("arguments", "closed", "code"),
+    [("--version", "<&- >&- 2>&-", 0), ("nonsense", "2>&-", 2), ("--help", ">&-", 0)],
+)
+def test_a_closed_stream_is_no_fault_and_no_file_gets_its_number(arguments: str, closed: str, code: int) -> None:
+    script = f'"{sys.executable}" -m lgmdjax {arguments} {closed}'
+    done = subprocess.run(
+        ["sh", "-c", script], capture_output=True, text=True, check=False, cwd=paths.PACKAGE_DIR.parent
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
+
+
+def test_null_devices_take_the_place_of_closed_streams() -> None:
+    script = "import os\nfrom lgmdjax.cli.main import exit_code\n"
+    script += "exit_code(lambda: os._exit(open('/dev/null').fileno()))"  # the first number that is free
+    done = subprocess.run(["sh", "-c", f'"{sys.executable}" -c "{script}" <&- >&- 2>&-'], cwd=paths.PACKAGE_DIR.parent)
+    assert done.returncode > 2
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_a_full_disk_is_one_line(number: int, capsys: pytest.CaptureFixture[str]) -> None:
+    from lgmdjax.cli.main import exit_code
+
+    def write() -> None:
+        raise OSError(number, os.strerror(number), "runs/new\n.npz")
+
+    assert exit_code(write) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("lgmdjax: expected space on the disk for runs/new .npz, got ")
 
 
 @pytest.mark.parametrize("arguments", [["trial", "corner", "--out", ""], ["trial", "corner", "--out="], ["watch", ""]])

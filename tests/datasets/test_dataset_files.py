@@ -3,6 +3,7 @@
 import csv
 import gzip
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -226,6 +227,8 @@ def test_wrong_requests_are_one_line(run: Path, tmp_path: Path, capsys: pytest.C
         ([str(run), out, "--format", "csv", "--video"], "--video with format lerobot or zarr, got csv"),
         ([str(run), str(tmp_path / "full")], "expected an empty or a new folder"),
         ([str(unknown), out, "--video"], "leave --video out"),
+        ([str(run), out, "--licence", "MIT\ntags: [x]"], "expected a licence such as Apache-2.0"),
+        ([str(run), os.fsdecode(b"caf\xe9")], "a folder with a name in UTF-8, got "),
     ):
         assert main.main(["export-dataset", *arguments]) == 2
         (line,) = capsys.readouterr().err.splitlines()

@@ -1,6 +1,7 @@
 """The exported folder: its card, all or nothing, and what is refused in one line."""
 
 import hashlib
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,8 @@ WHOLE = ("fit-gait/shaping.safetensors", "train/controller.safetensors", "train/
 def test_the_card_tells_what_to_connect_where(tmp_path):
     run, out = make_run(tmp_path / "quick-0", *WHOLE), tmp_path / "made" / "robot"
     (run / "evaluate").mkdir()
-    storage.write_json(run / "evaluate" / "evaluation.json", {"tube": {"learned": {"robots": 3}, "blind": {}}})
+    evaluation = {"tube": {"learned": {"robots": 3}, "blind": {}}, "indoor": {"teacher": {}}}
+    storage.write_json(run / "evaluate" / "evaluation.json", evaluation)
     card = exporter.export(run, out, width=160, formats=["c"])
     assert card == exporter.read_card(out)
     assert {path.name for path in out.iterdir()} == {"card.json", "nervous_system.c", "nervous_system.h"}
@@ -54,6 +56,21 @@ def test_the_card_tells_what_to_connect_where(tmp_path):
     assert card["robot"]["name"] == "quick-0" and len(card["robot"]["fingerprint"]) == 16
     left, right = card["eyes"]["positions"]
     assert left[1] == -right[1] > 0
+
+
+@pytest.mark.parametrize("evaluation", [[1], {"tube": [1]}, {"tube": None}, "tube"])
+def test_other_scores_are_one_line(tmp_path, evaluation):
+    (tmp_path / "evaluate").mkdir()
+    storage.write_json(tmp_path / "evaluate" / "evaluation.json", evaluation)
+    with pytest.raises(InputError, match=r"expected an object, got .*; run `lgmdjax evaluate` again"):
+        exporter._read_scores(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["für */ int x; /*", "a\nb\\", os.fsdecode(b"caf\xe9"), "??/" * 30])
+def test_any_name_of_a_robot_can_stand_in_the_comment(name, float32):
+    text = c_source.generate(nervous_system.from_robot(assembly.load_robot()), name)["nervous_system.h"]
+    comment = text.partition("#ifndef")[0]
+    assert comment.isascii() and comment.count("*/") == 1 and comment.rstrip().endswith("*/")
 
 
 @pytest.mark.parametrize("content", ["file", "folder with a file"])

@@ -119,7 +119,11 @@ def test_one_approach_is_too_few_to_choose_by():
         ("clip,kind,contact_s\na.mp4,collision,soon\n", "line 2: expected seconds.*soon"),
         ("clip,kind,contact_s\na.mp4,collision,-1\n", "expected seconds.*-1"),
         ("clip,kind,contact_s\na.mp4,,\n", "a clip and its kind"),
-        ("clip,kind,contact_s\na.mp4,none,\na.mp4,none,\n", r"\['a.mp4'\]"),
+        ("clip,kind,contact_s\na.mp4,none,\na.mp4,none,\n", "got a.mp4 twice"),
+        ("clip,kind,contact_s\n" + 2 * "".join(f"{k}.mp4,none,\n" for k in range(20_000)), "0.mp4 and others twice"),
+        ("clip,kind,contact_s\n../a.mp4,none,\n", "a clip in the folder of the videos"),
+        ("clip,kind,contact_s\n/etc/passwd,none,\n", "a clip in the folder of the videos"),
+        ("clip,kind,contact_s\na/../../b,none,\n", "a clip in the folder of the videos"),
         (None, "got no such file"),
     ],
 )

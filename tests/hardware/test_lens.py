@@ -154,6 +154,10 @@ def test_files_are_read_as_they_were_written(tmp_path: Path, name: str) -> None:
         ({"K": [[0, 0, 160], [0, 0, 120], [0, 0, 1]]}, "focal lengths above 0"),
         ({"D": [0.1] * 5}, "4 numbers for fisheye"),
         ({"D": "none"}, "4 numbers"),
+        ({"D": [0.1, 0, 0, 10**400]}, "4 numbers"),
+        ({"size": [320, float("inf")]}, "width and height"),
+        ({"size": [True, 240]}, "width and height"),
+        ({"K": [[300, 0, 160], [5, 300, 120], [0, 0, 1]]}, "focal lengths above 0"),
     ],
 )
 def test_a_wrong_file_is_one_line(tmp_path: Path, change: dict[str, object], words: str) -> None:
@@ -170,6 +174,11 @@ def test_a_missing_file_and_one_that_is_no_calibration_are_one_line(tmp_path: Pa
     (tmp_path / "list.json").write_text("[1, 2]")
     with pytest.raises(InputError, match="an object with model"):
         lens.read(tmp_path / "list.json")
+    for content in ("[" * 100_000, "K: [", "a\x02: \x1b[2J", "%YAML:1.0\n---\nK 3"):
+        (tmp_path / "noise.yaml").write_text(content)
+        with pytest.raises(InputError, match="expected") as error:
+            lens.read(tmp_path / "noise.yaml")
+        assert str(error.value).isprintable()
     (tmp_path / "noise.yaml").write_bytes(b"\x00\xff\xfe")
     with pytest.raises(InputError, match="as text"):
         lens.read(tmp_path / "noise.yaml")

@@ -51,6 +51,15 @@ def test_the_video_has_the_right_number_size_and_rate_of_images(decoded: tuple[l
     assert rate == pytest.approx(12)
 
 
+def test_another_video_is_rendered_by_the_same_program(
+    decoded: tuple[list[np.ndarray], float], walk: walk_video.WalkTrace
+):
+    """Else each video of a process would be compiled anew, and take memory for good."""
+    before = walk_video._render_views._cache_size()
+    assert walk_video.write_trace(io.BytesIO(), walk, synthetic.room(), EYES, seconds=0.25) == 3
+    assert walk_video._render_views._cache_size() == before > 0
+
+
 def test_curves_grow_during_the_video(decoded: tuple[list[np.ndarray], float]):
     def coloured_pixels(image: np.ndarray) -> int:
         """Count the coloured pixels of the curves."""

@@ -302,6 +302,13 @@ def test_a_name_with_a_path_in_it_is_refused(tmp_path: Path, name: str) -> None:
         open_run(tmp_path, name, "smoke", 0, SETTINGS)
 
 
+def test_a_name_that_is_not_utf_8_is_refused(tmp_path: Path) -> None:
+    """Before hours of work: the checkpoints of a fit could not be written there."""
+    with pytest.raises(InputError, match=r"expected a folder with a name in UTF-8, got .*caf\\udce9"):
+        open_run(tmp_path / os.fsdecode(b"caf\xe9"), "run", "quick", 0, {})
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_run_folder_is_locked_while_stages_run(run: Run) -> None:
     refusals: list[str] = []
 

@@ -69,7 +69,7 @@ def test_rooms_in_which_nothing_moves_have_one_row():
 def test_walks_of_unknown_rooms_are_one_line(trial):
     walk = episodes.read(trial)[0]
     for parameters in ({"mine": 1}, {"trial": "dynamic"}, {"trial": "nowhere", "seeds": 2}, {"live": {"arena": []}}):
-        with pytest.raises(InputError, match=r"expected (walks of|a walk that)"):
+        with pytest.raises(InputError, match=r"expected (walks of|a walk that|an object with trial|one of testing)"):
             sources.room_of(parameters, walk, 2, trial)
 
 
