@@ -1,5 +1,6 @@
 """Rooms of recorded walks: each walk in its own, and headers that describe none."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -44,7 +45,7 @@ def test_a_trial_has_more_rooms_than_seeds(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_walks_of_collect_count_their_rooms_through_all_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    batches = {0: numbered_rooms(2), 1: numbered_rooms(2).replace(start=numbered_rooms(2).start + 10)}
+    batches = {0: numbered_rooms(2), 1: replace(numbered_rooms(2), start=numbered_rooms(2).start + 10)}
     monkeypatch.setattr(room_batches, "training_rooms", lambda _, batch, robots: SimpleNamespace(arena=batches[batch]))
     assert starts({"robots": 2}, [0, 1, 2, 3]) == [0, 1, 10, 11]
 

