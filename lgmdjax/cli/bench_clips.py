@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from lgmdjax.cli.flags import AlarmFlags, BenchFlags
 from lgmdjax.detectors import alarm
-from lgmdjax.errors import InputError
+from lgmdjax.errors import InputError, one_line
 from lgmdjax.evaluation import clip_labels, clip_responses, clip_scores, stimulus_scores
 from lgmdjax.evaluation.clip_labels import Label
 from lgmdjax.evaluation.clip_responses import Clip, Trace
@@ -77,10 +77,11 @@ def _read_arguments(paths: Sequence[Path]) -> tuple[Path, list[Label]]:
     videos = {path.name for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES}
     unlabelled = sorted(videos - {label.clip for label in labels})
     if unlabelled:
-        print(f"note: no label for {', '.join(unlabelled)}; add rows to score them", file=sys.stderr)
+        print(one_line(f"note: no label for {', '.join(unlabelled)}; add rows to score them"), file=sys.stderr)
     unusual = sorted({label.kind for label in labels} - {*clip_labels.APPROACHING, *clip_labels.OTHERS})
     if unusual:
-        print(f"note: clips of kind {', '.join(unusual)} should raise no alarm; check the spelling", file=sys.stderr)
+        note = f"note: clips of kind {', '.join(unusual)} should raise no alarm; check the spelling"
+        print(one_line(note), file=sys.stderr)
     return folder, labels
 
 

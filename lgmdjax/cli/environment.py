@@ -21,9 +21,7 @@ def check() -> None:
         try:
             start()
         except Exception as error:  # a library may raise anything for a variable that it can't read
-            reason, variables = one_line(error)[:300] or type(error).__name__, jax_setup.user_variables()
-            advice = f"change or unset {variables}" if variables else "reinstall lgmdjax and its dependencies"
-            raise InputError(f"expected an environment in which {name} starts, got {reason}; {advice}") from error
+            raise InputError(_fault(name, error)) from error
 
 
 def explain(error: Exception) -> str:
@@ -32,6 +30,8 @@ def explain(error: Exception) -> str:
         return f"expected more memory, got {one_line(error)[:200]}; run fewer robots at once"
     if isinstance(error, RuntimeError) and "start new thread" in str(error):
         return f"expected to start a thread, got {one_line(error)}; allow more processes or memory (ulimit)"
+    if "Unable to initialize backend" in str(error):  # a second attempt could succeed, with the backends that are left
+        return _fault("JAX", error)
     try:
         check()
     except InputError as fault:
@@ -39,10 +39,17 @@ def explain(error: Exception) -> str:
     return ""
 
 
+def _fault(library: str, error: Exception) -> str:
+    reason, variables = one_line(error)[:300] or type(error).__name__, jax_setup.user_variables()
+    advice = f"change or unset {variables}" if variables else "reinstall lgmdjax and its dependencies"
+    return f"expected an environment in which {library} starts, got {reason}; {advice}"
+
+
 def _start_jax() -> None:
     import jax
+    import numpy as np
 
-    jax.devices()
+    np.asarray(jax.numpy.ones(2) + np.ones(2))  # both ways between host and device, which a variable may forbid
 
 
 def _start_mujoco() -> None:

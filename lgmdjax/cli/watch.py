@@ -31,7 +31,7 @@ from lgmdjax.cli import watch_files
 from lgmdjax.cli.flags import WatchFlags
 from lgmdjax.cli.watch_files import Detectors, Responses, TableFormat
 from lgmdjax.detectors import alarm, lgmd
-from lgmdjax.errors import InputError
+from lgmdjax.errors import InputError, one_line
 from lgmdjax.hardware import live_source
 from lgmdjax.reporting import lgmd_overlay, video_geometry, video_io
 from lgmdjax.runtime import partial_files
@@ -168,8 +168,10 @@ def _print_notes(path: Path, video: video_io.Video) -> None:
         )
     if video.left_out:
         print(
-            f"note: {path} begins between two key frames or with damage: {video.left_out} packets before the first "
-            "whole frame are left out; check whether the beginning matters",
+            one_line(
+                f"note: {path} begins between two key frames or with damage: {video.left_out} packets before the first "
+                "whole frame are left out; check whether the beginning matters"
+            ),
             file=sys.stderr,
         )
 

@@ -63,6 +63,12 @@ def check_variables() -> None:
     count = os.environ.get(COUNT, "1")
     if not (count.isascii() and count.isdigit() and 0 < int(count) <= 1024):
         raise InputError(f"expected {COUNT} of 1 to 1024, got {count!r}; unset it for one device on each core")
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    if flags and not (all(flag.startswith("--xla_") for flag in flags) or Path(flags[0]).is_file()):
+        raise InputError(
+            f"expected XLA_FLAGS of the form --xla_name=value, or a file of them, got {' '.join(flags)!r}; change or "
+            "unset it"
+        )  # XLA itself would end the process; so it does for names that it does not know
     limit = resource.getrlimit(resource.RLIMIT_AS)[0] if resource is not None else -1
     if 0 <= limit < MIN_MEMORY:
         gigabytes = f"expected {MIN_MEMORY / 1e9:g} GB of memory or more, got a limit of {limit / 1e9:.2g} GB"

@@ -4,6 +4,7 @@ from . import dashboard as dashboard
 from . import edits as edits
 from . import live as live
 from . import live_step as live_step
+from . import markdown as markdown
 from . import messages as messages
 from . import page as page
 from . import server as server

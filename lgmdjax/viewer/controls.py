@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from lgmdjax.control.names import POLICY_NAMES
 from lgmdjax.reporting.playback import Playback, contacts_of
 from lgmdjax.reporting.walk_scene import HAS_VISER
+from lgmdjax.viewer import markdown
 from lgmdjax.viewer.messages import RANDOM_ROOM, Constants, Controls
 
 if HAS_VISER:
@@ -74,7 +75,7 @@ class Transport:
         touches = contacts_of(playback)
         marks = tuple((float(playback.time[frame]), "✖") for frame in touches[:MAX_MARKS])
         noun = "collision" if len(touches) == 1 else "collisions"
-        self._title.content = f"**{playback.title}**: {len(touches) or 'no'} {noun}"
+        self._title.content = f"{markdown.bold(playback.title)}: {len(touches) or 'no'} {noun}"
         if names:
             self._walk.options, self._walk.visible = tuple(names), len(names) > 1
             self._walk.value = names[index]

@@ -19,6 +19,7 @@ from lgmdjax.reporting import playback as playbacks
 from lgmdjax.reporting.playback import Playback
 from lgmdjax.reporting.walk_scene import HAS_VISER, WalkScene
 from lgmdjax.runtime import interruption
+from lgmdjax.viewer import markdown
 from lgmdjax.viewer.controls import LivePanel, Playing, Transport
 from lgmdjax.viewer.dashboard import Dashboard
 from lgmdjax.viewer.messages import (
@@ -120,7 +121,7 @@ class Viewer:
         """Show a report of the simulator."""
         match report:
             case Status(text=text, failed=failed):
-                self.status.content = f"**{text}**"
+                self.status.content = markdown.bold(text)
                 if failed:
                     self._fail(text)
             case Walks():
@@ -222,7 +223,7 @@ class Viewer:
             raise InputError(text)
         if self.is_live:
             self._go_back()
-            self.status.content = f"**{text}**"
+            self.status.content = markdown.bold(text)
 
     def _advance(self, elapsed: float) -> None:
         """Show the next frame of the recorded walk."""

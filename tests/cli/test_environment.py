@@ -33,7 +33,7 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
     ("name", "value", "library"),
     [
         ("JAX_PLATFORMS", "nonsense", "JAX"),
-        ("JAX_ENABLE_X64", "perhaps", "JAX"),
+        ("JAX_TRANSFER_GUARD", "disallow", "JAX"),
         ("MUJOCO_GL", "nonsense", "MuJoCo"),
         ("MPLBACKEND", "nonsense", "Matplotlib"),
     ],
@@ -51,6 +51,21 @@ def test_an_impossible_number_of_devices_is_named(value: str, monkeypatch: pytes
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", value)
     with pytest.raises(InputError, match=f"expected JAX_NUM_CPU_DEVICES of 1 to 1024, got '{value}'"):
         environment.check_jax()
+
+
+@pytest.mark.parametrize("value", ["nonsense", "--nonsense", "--xla_cpu_use_fusion_emitters=true -x", "xla_dump_to=a"])
+def test_flags_with_which_xla_would_end_the_process_are_named(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", value)
+    with pytest.raises(InputError, match=f"expected XLA_FLAGS of the form --xla_name=value, .*got '{value}'"):
+        environment.check_jax()
+
+
+def test_a_backend_that_is_missing_is_named() -> None:
+    """JAX fails at the first attempt alone."""
+    error = RuntimeError("Unable to initialize backend 'x': it is not in the list of known backends")
+    assert environment.explain(error).startswith(
+        "expected an environment in which JAX starts, got Unable to initialize"
+    )
 
 
 def test_a_limit_of_memory_in_which_xla_would_end_the_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """The viewer's server: one address, pages of its own alone, one line for what cannot be had."""
 
 import asyncio
+import re
 import socket
 from collections.abc import Iterator
 
@@ -10,6 +11,7 @@ import websockets
 from websockets.asyncio.client import connect
 
 from lgmdjax.errors import InputError
+from lgmdjax.viewer import markdown
 from lgmdjax.viewer import server as web
 
 
@@ -61,6 +63,52 @@ def test_it_listens_on_the_loopback_address_alone(server):
     listening = server._websock_server._port
     with socket.socket() as other:
         other.bind(("127.0.0.2", listening))  # free, unless the server listens on all addresses
+
+
+OUTSIDE = (
+    "/../../../../../../../../etc/passwd",
+    "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+    "/..%2f..%2f..%2f..%2f..%2f..%2f..%2f..%2fetc/passwd",
+    "/..%5c..%5c..%5cetc%5cpasswd",
+    "//etc/passwd",
+    "/etc/passwd",
+    "/file:///etc/passwd",
+    "http://127.0.0.1/etc/passwd",
+    "/index.html/../../../../../../../../../etc/passwd",
+    "/assets/..%00/etc/passwd",
+    "/__init__.py",
+    "/../__init__.py",
+)
+
+
+@pytest.mark.parametrize("path", OUTSIDE)
+def test_no_file_outside_of_the_page_is_served(server, path):
+    """Asked byte by byte, since a client library would tidy the path up first."""
+    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=20) as connection:
+        connection.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.get_port()}\r\n\r\n".encode())
+        answer = b"".join(iter(lambda: connection.recv(65536), b""))
+    assert answer.startswith(b"HTTP/1.1 404 ") and len(answer) < 1000
+
+
+HOSTILE = (
+    "<script>alert(1)</script>",
+    "<iframe srcdoc='<script>alert(1)</script>'>",
+    "![x](/etc/hostname.png)",
+    "![x](http://example.org/x.png)",
+    "[here](javascript:alert(1))",
+    "`a` *b* _c_ {d} ~e~ \\ & # + - .",
+)
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_names_on_the_page_are_text(server, text, monkeypatch):
+    """viser renders HTML in Markdown, and its server reads the pictures that Markdown names."""
+    monkeypatch.setattr(viser._gui_handles, "_get_data_url", lambda *_: pytest.fail("a picture is read"))
+    shown = server.gui.add_markdown(markdown.bold(f"line\n{text}"))._markdown
+    assert shown.startswith("**") and shown.endswith("**") and "\n" not in shown
+    unescaped = re.sub(r"\\([!-/:-@\[-`{-~])", "", shown[2:-2])
+    assert not re.search(r"[!-/:-@\[-`{-~]", unescaped)  # every mark has a backslash of its own
+    assert re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", shown[2:-2]) == f"line {text}"
 
 
 def test_a_port_or_an_address_that_cannot_be_had_is_one_line(server):

@@ -7,12 +7,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lgmdjax.errors import one_line
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime.storage import JsonObject
 
 COLOURS = (*style.PALETTE, style.DARK, style.GREY, style.RED, "#8c564b")
 ADAPTED_COLOUR, OWN_COLOUR = style.LEFT_COLOUR, style.RIGHT_COLOUR
 STRIP_HEIGHT, TRACE_HEIGHT, TITLE_HEIGHT = 0.75, 0.6, 0.9  # inches
+MAX_TITLE = 90  # characters
 
 
 class Responses(NamedTuple):
@@ -56,8 +58,7 @@ def plot_roc(rows: Sequence[JsonObject]) -> Figure:
 def plot_clip(clip: ClipView, responses: Mapping[str, Responses]) -> Figure:
     """Plot the responses of detectors to a clip below its pictures, each at its time."""
     height = TITLE_HEIGHT + STRIP_HEIGHT + TRACE_HEIGHT * len(responses)
-    figure = Figure(figsize=(style.WIDTH, height))
-    figure.set_layout_engine("none")  # arranged by hand for speed: there is a figure for each clip
+    figure = Figure(figsize=(style.WIDTH, height), layout="none")  # by hand, for speed: each clip has a figure
     figure.subplots_adjust(left=0.2, right=0.98, top=1 - 0.25 / height, bottom=0.62 / height, hspace=0.3)
     ratios = [STRIP_HEIGHT] + [TRACE_HEIGHT] * len(responses)
     panels = np.atleast_1d(figure.subplots(1 + len(responses), 1, sharex=True, height_ratios=ratios))
@@ -65,7 +66,7 @@ def plot_clip(clip: ClipView, responses: Mapping[str, Responses]) -> Figure:
     for axes, (name, response) in zip(panels[1:], responses.items(), strict=True):
         _draw_trace(axes, clip, response)
         axes.set_ylabel(name, rotation=0, ha="right", va="center")
-    panels[0].set_title(clip.title)
+    panels[0].set_title(one_line(clip.title)[:MAX_TITLE], parse_math=False)  # a file may have any name
     panels[-1].set_xlabel("time [s]")
     lines = [
         panels[-1].plot([], [], color=colour, linewidth=width)[0]
