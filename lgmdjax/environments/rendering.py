@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, UInt8
 
 from lgmdjax import geometry
 from lgmdjax.environments.functional import Environment, State
-from lgmdjax.reporting import third_person, walk_video
+from lgmdjax.reporting import robot_shape, third_person, walk_video
 from lgmdjax.reporting.third_person import RobotCapsules, Viewpoint
 from lgmdjax.simulation.closed_loop import FRAME_RATE
 from lgmdjax.world import arena
@@ -28,7 +28,7 @@ def render(environment: Environment, state: State) -> UInt8[np.ndarray, "height 
         state: of one robot.
     """
     qpos = np.asarray(state.robot.data.qpos, float)
-    body = walk_video.body_geometry(qpos[None], environment.params.body)
+    body = robot_shape.body_geometry(qpos[None], environment.params.body)
     heading = geometry.yaw(qpos[3:7])
     forward = np.array([np.cos(heading), np.sin(heading), 0.0])
     target = qpos[:3]

@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -233,7 +233,7 @@ def _model(content: Mapping[str, object], path: Path) -> Model:
 
 def _size(content: Mapping[str, object], path: Path) -> tuple[int, int]:
     both = _find(content, "size", "image_size", "img_shape")
-    sides = both if isinstance(both, list) else [_find(content, *WIDTHS), _find(content, *HEIGHTS)]
+    sides: list[Any] = both if isinstance(both, list) else [_find(content, *WIDTHS), _find(content, *HEIGHTS)]
     if len(sides) != 2 or not all(SIDE.accepts(side) and side == int(side) for side in sides):
         raise InputError(f"{path}: expected size, width and height in px, got {one_line(sides)[:80]}; {REMEDY}")
     width, height = map(int, sides)

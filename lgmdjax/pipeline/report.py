@@ -30,7 +30,7 @@ from lgmdjax.paths import PACKAGE_DIR
 from lgmdjax.pipeline import report_data, report_figures
 from lgmdjax.pipeline.report_figures import NOMINAL_SPEED, TITLES, VARIANTS
 from lgmdjax.pipeline.settings import ReportSettings
-from lgmdjax.reporting import pages, walk_page, walk_video
+from lgmdjax.reporting import pages, robot_shape, walk_page
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime import partial_files
 from lgmdjax.runtime.storage import JsonObject, read_arrays, read_file
@@ -158,7 +158,7 @@ def _names() -> JsonObject:
 def _robot_size(body: Body | None) -> dict[str, float]:
     """Measure length and width of the standing robot's visible parts, and the distance of its eyes [m]."""
     stance = robot_xml.compiled(body).key("stance").qpos
-    starts, ends, eyes, _, radii, _ = walk_video.body_geometry(stance[None], body)
+    starts, ends, eyes, _, radii, _ = robot_shape.body_geometry(stance[None], body)
     tips, thick = np.stack([starts[0], ends[0]]), radii[:, None]
     length, width, _ = np.max(tips + thick, axis=(0, 1)) - np.min(tips - thick, axis=(0, 1))
     return {"length": float(length), "width": float(width), "eyes": float(np.linalg.norm(eyes[0, 0] - eyes[0, 1]))}

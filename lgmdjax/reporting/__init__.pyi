@@ -3,6 +3,7 @@ from . import inline_video as inline_video
 from . import lgmd_overlay as lgmd_overlay
 from . import pages as pages
 from . import playback as playback
+from . import robot_shape as robot_shape
 from . import room_shape as room_shape
 from . import selection as selection
 from . import third_person as third_person

@@ -19,7 +19,6 @@ from typing import BinaryIO, NamedTuple
 import jax
 import jax.numpy as jnp
 import matplotlib
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 from matplotlib.colors import to_rgb
@@ -29,10 +28,9 @@ from PIL import Image
 from scipy import ndimage
 
 from lgmdjax import geometry
-from lgmdjax.body import robot_xml
 from lgmdjax.body.robot_xml import Body
 from lgmdjax.errors import InputError
-from lgmdjax.reporting import selection, third_person, video_io
+from lgmdjax.reporting import robot_shape, selection, third_person, video_io
 from lgmdjax.reporting.figures.style import DARK, LEFT_COLOUR, LIGHT_GREY, RED, RIGHT_COLOUR, STYLE
 from lgmdjax.reporting.third_person import RobotCapsules, Viewpoint
 from lgmdjax.sensors import camera, hemifield
@@ -63,17 +61,6 @@ class WalkTrace(NamedTuple):
     u: Float[ndarray, "frames 2"]
     velocity: Float[ndarray, "frames 2"]  # multiples of 0.05 m/s
     contact: Bool[ndarray, " frames"]
-
-
-class BodyGeometry(NamedTuple):
-    """The robot's visible capsules and its eyes in n poses."""
-
-    starts: Float[ndarray, "n capsules 3"]  # m, world
-    ends: Float[ndarray, "n capsules 3"]  # m, world
-    eye_positions: Float[ndarray, "n 2 3"]  # m, world
-    eye_rotations: Float[ndarray, "n 2 3 3"]
-    radii: Float[ndarray, " capsules"]  # m
-    colours: Float[ndarray, "capsules 3"]  # 0..1
 
 
 class _Views(NamedTuple):
@@ -155,8 +142,7 @@ def write_trace(
     """
     _check(trace)
     frames = selection.select_segment(trace.position, trace.velocity, round(seconds * VIDEO_RATE) * FRAME_STRIDE)
-    shown = frames[::FRAME_STRIDE]
-    views, robot = _views(trace, room, shown, body_geometry(to_qpos(trace, shown), body))
+    views, robot = _views(trace, room, frames[::FRAME_STRIDE], body)
     page = _Page(trace, frames, (eyes.width, eyes.height))
     with video_io.open_writer(target, *VIDEO_SIZE, VIDEO_RATE) as write:
         for index, (view, eye_images) in enumerate(_render(views, robot, eyes)):
@@ -177,13 +163,18 @@ def _check(trace: WalkTrace) -> None:
 
 
 def _views(
-    trace: WalkTrace, room: arena.Arena, rows: Int[ndarray, " n"], body: BodyGeometry
+    trace: WalkTrace, room: arena.Arena, rows: Int[ndarray, " n"], of: Body | None = None
 ) -> tuple[_Views, RobotCapsules]:
-    """Compute the poses of cameras, eyes and limbs in the chosen frames, and their rooms."""
+    """Compute the poses of cameras, eyes and limbs in the chosen frames, and their rooms.
+
+    The camera is farther from a robot of one's own that is larger than the package's.
+    """
+    body = robot_shape.body_geometry(to_qpos(trace, rows), of)
+    far = robot_shape.size_ratio(of)
     position, heading = _smooth(trace)
     forward = np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=-1)[rows]
     target = position[rows]
-    camera_position = target - CAMERA_BEHIND * forward + np.array([0, 0, CAMERA_ABOVE])
+    camera_position = target + far * (np.array([0, 0, CAMERA_ABOVE]) - CAMERA_BEHIND * forward)
     to_single = partial(jnp.asarray, dtype=jnp.float32)
     views = _Views(
         time=to_single(trace.time[rows]),
@@ -228,46 +219,6 @@ def to_qpos(trace: WalkTrace, rows: Int[ndarray, " n"]) -> Float[ndarray, "n 25"
     """Return the chosen frames of a walk in MuJoCo's coordinates (qpos)."""
     joints = trace.joints[rows].reshape(len(rows), -1)
     return np.concatenate([trace.position[rows], trace.quaternion[rows], joints], axis=1)
-
-
-def body_geometry(qpos: Float[ndarray, "n 25"], body: Body | None = None) -> BodyGeometry:
-    """Compute the robot's visible capsules and its eyes in n poses with C MuJoCo's kinematics.
-
-    Other shapes than spheres and capsules are drawn as capsules along their longest axis.
-    """
-    model = robot_xml.compiled(body)
-    data = mujoco.MjData(model)
-    visible = np.flatnonzero(model.geom_group == 2)
-    sites = [model.site(name).id for name in robot_xml.EYES]
-    axes, half_length, radii = _capsules(model, visible)
-    rows = []
-    for pose in qpos:
-        data.qpos[:] = pose
-        mujoco.mj_kinematics(model, data)
-        rotations = data.geom_xmat[visible].reshape(-1, 3, 3)
-        half_axis = np.take_along_axis(rotations, axes[:, None, None], axis=2)[..., 0] * half_length[:, None]
-        centres, rotations = data.geom_xpos[visible], data.site_xmat[sites].reshape(2, 3, 3)
-        rows.append((centres - half_axis, centres + half_axis, data.site_xpos[sites].copy(), rotations.copy()))
-    material = model.geom_matid[visible, None]
-    colours = np.where(material < 0, model.geom_rgba[visible, :3], model.mat_rgba[material[:, 0], :3])
-    starts, ends, eye_positions, eye_rotations = map(np.stack, zip(*rows, strict=True))
-    return BodyGeometry(starts, ends, eye_positions, eye_rotations, radii, colours)
-
-
-def _capsules(
-    model: mujoco.MjModel, geoms: Int[ndarray, " n"]
-) -> tuple[Int[ndarray, " n"], Float[ndarray, " n"], Float[ndarray, " n"]]:
-    """Return the axis along which each geom lies, and half the length and the radius of a capsule for it [m]."""
-    kinds, sizes = model.geom_type[geoms], model.geom_size[geoms]
-    axes, half_length, radii = np.full(len(geoms), 2), sizes[:, 1].copy(), sizes[:, 0].copy()
-    half_length[kinds == mujoco.mjtGeom.mjGEOM_SPHERE] = 0.0
-    for index in np.flatnonzero(~np.isin(kinds, (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE))):
-        is_round = kinds[index] == mujoco.mjtGeom.mjGEOM_CYLINDER
-        half = sizes[index, [0, 0, 1]] if is_round else sizes[index]
-        axes[index] = np.argmax(half)
-        radii[index] = np.delete(half, axes[index]).mean()
-        half_length[index] = max(half.max() - radii[index], 0.0)
-    return axes, half_length, radii
 
 
 def _render(

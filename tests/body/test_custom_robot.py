@@ -14,7 +14,7 @@ from lgmdjax.body import custom_robot, hexapod, robot_description, robot_xml
 from lgmdjax.errors import InputError
 from lgmdjax.evaluation import contacts, gait_test
 from lgmdjax.locomotion import cpg, gait_fit, kinematics, tripod_gait
-from lgmdjax.reporting import walk_video
+from lgmdjax.reporting import robot_shape
 from lgmdjax.runtime import storage
 from lgmdjax.simulation import assembly
 from lgmdjax.transfer import robot_model
@@ -182,7 +182,7 @@ def test_the_page_shows_the_robot_of_the_tests():
 
 def test_all_that_draws_or_measures_a_robot_uses_its_body(walker, ours):
     stance = ours.key("stance").qpos[None]
-    drawn = walk_video.body_geometry(stance, walker.body)
+    drawn = robot_shape.body_geometry(stance, walker.body)
     visible = np.flatnonzero(ours.geom_group == 2)
     assert drawn.starts.shape == (1, len(visible), 3) and len(visible) == 4 + 5 * 6
     np.testing.assert_allclose(drawn.eye_positions[0, 0], [0.142, 0.036, 0.034 + stance[0, 2]], atol=1e-6)

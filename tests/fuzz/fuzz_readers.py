@@ -71,7 +71,7 @@ def _stamped(content: object) -> bytes:
     return json.dumps(checksums.add_checksum(content) if isinstance(content, dict) else content).encode()
 
 
-def _json_value(data: atheris.FuzzedDataProvider, depth: int = 3) -> Any:
+def _json_value(data: Any, depth: int = 3) -> Any:
     """Return a JSON value: mostly small numbers, and what readers may not expect."""
     odd = [None, True, False, 0, 1, -1, 2**31, 2**63, 10**400, 0.5, 1e308, float("inf"), float("nan"), "", "x", [], {}]
     kind = data.ConsumeIntInRange(0, 5 if depth else 3)
@@ -90,7 +90,7 @@ def _json_value(data: atheris.FuzzedDataProvider, depth: int = 3) -> Any:
     }
 
 
-def _changed(data: atheris.FuzzedDataProvider, value: Any, chance: int = 8) -> Any:
+def _changed(data: Any, value: Any, chance: int = 8) -> Any:
     """Return a JSON value with some of its parts replaced or left out."""
     if data.ConsumeIntInRange(0, chance) == 0:
         return _json_value(data)
@@ -125,7 +125,7 @@ def walks(content: bytes) -> None:
     episodes.read(FOLDER / "walks")
 
 
-def _column(data: atheris.FuzzedDataProvider, rows: int, like: pa.ChunkedArray) -> pa.Array | pa.ChunkedArray:
+def _column(data: Any, rows: int, like: pa.ChunkedArray) -> pa.Array | pa.ChunkedArray:
     values = like.to_pylist()[:rows]
     kind = data.ConsumeIntInRange(0, 12)
     if kind == 0:
@@ -149,7 +149,7 @@ def _column(data: atheris.FuzzedDataProvider, rows: int, like: pa.ChunkedArray) 
     return pa.array(values, like.type)
 
 
-def _table(data: atheris.FuzzedDataProvider, whole: pa.Table) -> pa.Table:
+def _table(data: Any, whole: pa.Table) -> pa.Table:
     """Return a table with some columns changed, left out, repeated or renamed."""
     rows = data.ConsumeIntInRange(0, whole.num_rows)
     touched = {data.ConsumeIntInRange(0, whole.num_columns - 1) for _ in range(data.ConsumeIntInRange(0, 4))}
@@ -186,7 +186,7 @@ def live_walk(content: bytes) -> None:
     edits.read_edits(_changed(data, LIVE), 10, FOLDER)
 
 
-def _tensors(data: atheris.FuzzedDataProvider, path: Path, kind: storage.TensorFile) -> Path:
+def _tensors(data: Any, path: Path, kind: storage.TensorFile) -> Path:
     """Write safetensors with other contents than those of a file, mostly with the right checksum."""
     tensors, metadata = storage.load_tensors(path, kind)
     found = {}

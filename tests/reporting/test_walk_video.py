@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
+from walker import DATA
 
+from lgmdjax.body import custom_robot, robot_xml
 from lgmdjax.errors import InputError
-from lgmdjax.reporting import inline_video, third_person, walk_video
+from lgmdjax.reporting import inline_video, robot_shape, third_person, walk_video
 from lgmdjax.sensors import camera
 from lgmdjax.simulation import assembly
 from lgmdjax.simulation.closed_loop import Room
@@ -92,7 +94,7 @@ def test_the_image_is_dimmed_outside_the_hemifield(walk: walk_video.WalkTrace):
 
 
 def test_eyes_are_fixed_to_the_trunk(walk: walk_video.WalkTrace):
-    body = walk_video.body_geometry(walk_video.to_qpos(walk, np.array([0, 150])), None)
+    body = robot_shape.body_geometry(walk_video.to_qpos(walk, np.array([0, 150])))
     for row, position, rotation in zip((0, 150), body.eye_positions, body.eye_rotations, strict=True):
         yaw = 2 * np.arctan2(walk.quaternion[row, 3], walk.quaternion[row, 0])
         forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
@@ -101,10 +103,12 @@ def test_eyes_are_fixed_to_the_trunk(walk: walk_video.WalkTrace):
         assert (position[0] - walk.position[row]) @ forward > 0.1
 
 
-def test_the_robot_is_always_in_its_window_of_the_image(walk: walk_video.WalkTrace):
-    rows = np.arange(0, 300, 10)
-    body = walk_video.body_geometry(walk_video.to_qpos(walk, rows), None)
-    views, robot = walk_video._views(walk, synthetic.room(), rows, body)
+@pytest.mark.parametrize("own", [False, True])
+def test_the_robot_is_always_in_its_window_of_the_image(walk: walk_video.WalkTrace, own: bool):
+    body = custom_robot.read(DATA / "walker.toml").body if own else None
+    rise = robot_xml.compiled(body).key("stance").qpos[2] - robot_xml.compiled().key("stance").qpos[2]
+    higher = walk._replace(position=walk.position + np.array([0.0, 0.0, rise]))
+    views, robot = walk_video._views(higher, synthetic.room(), np.arange(0, 300, 10), body)
     params = third_person.Params()
     ends = jnp.concatenate([views.starts, views.ends], 1)
     for position, rotation, points in zip(views.camera_position, views.camera_rotation, ends, strict=True):

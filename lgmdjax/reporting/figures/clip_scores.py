@@ -58,7 +58,8 @@ def plot_roc(rows: Sequence[JsonObject]) -> Figure:
 def plot_clip(clip: ClipView, responses: Mapping[str, Responses]) -> Figure:
     """Plot the responses of detectors to a clip below its pictures, each at its time."""
     height = TITLE_HEIGHT + STRIP_HEIGHT + TRACE_HEIGHT * len(responses)
-    figure = Figure(figsize=(style.WIDTH, height), layout="none")  # by hand, for speed: each clip has a figure
+    figure = Figure(figsize=(style.WIDTH, height))
+    figure.set_layout_engine("none")  # arranged by hand for speed: there is a figure for each clip
     figure.subplots_adjust(left=0.2, right=0.98, top=1 - 0.25 / height, bottom=0.62 / height, hspace=0.3)
     ratios = [STRIP_HEIGHT] + [TRACE_HEIGHT] * len(responses)
     panels = np.atleast_1d(figure.subplots(1 + len(responses), 1, sharex=True, height_ratios=ratios))
