@@ -1,4 +1,4 @@
-"""Train the robot that is part of the package: `python experiments/train_pretrained.py`, 25 to 45 minutes on 2 cores.
+"""Train the robot that is part of the package: `python experiments/train_pretrained.py`, 24 minutes on 2 cores.
 
 The pretrained robot is that of one run: its controller with the gait that it was trained on. After an interruption the
 same command resumes.

@@ -105,10 +105,10 @@ SCALES: Mapping[Scale, Mapping[str, StageSettings | StudySettings]] = {
             epochs=100,
             dagger_rounds=8,
             round_epochs=60,
-            robots=64,
-            round_seconds=60,
+            robots=32,
+            round_seconds=120,
             split_half_epochs=1000,
-            turn_gains=(1.0, 1.25, 1.5, 2.0),
+            turn_gains=(1.0, 1.5, 2.0, 2.5),
         ),
         "evaluate": EvaluateSettings(
             trials=(

@@ -4,7 +4,7 @@
 | ----------------- | ------------------------------------------------------------------------- |
 | `random_rooms`    | random obstacles, sampled from a key                                      |
 | `replicate_room`  | one arena for all robots, with different starts                           |
-| `training_rooms`  | random rooms of one training episode, varied, some with moving obstacles  |
+| `training_rooms`  | random rooms of one training episode, of various contrasts                |
 | `benchmark_rooms` | held-out random rooms in which studies compare robots                     |
 """
 
@@ -18,14 +18,12 @@ from jaxtyping import Array, Float
 from lgmdjax.simulation.closed_loop import Room
 from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.world import scenes
-from lgmdjax.world.arena import Arena, at_time, sample_free_poses
+from lgmdjax.world.arena import Arena, sample_free_poses
 
 START_COUNT = 32  # start poses of a room, used in order, a new one after each reset
 BENCHMARK_EPISODE = 2**23  # episode number of `benchmark_rooms`, above those of all training episodes
 CONTRAST_RANGE = (0.3, 1.0)  # factors by which the contrast of training rooms is scaled
 OVERHEAD_SHARE = 0.2  # of the obstacles in training rooms
-CROSSING_SHARE = 0.5  # probability that a box, and that a cylinder, moves into the way of the robot in a training room
-AT_REST = 60.0  # s; after it nothing moves in training rooms
 
 
 @partial(jax.jit, static_argnames="count")
@@ -71,30 +69,21 @@ def stack_rooms(rooms: list[Room]) -> Room:
 
 
 def training_rooms(seed: int, episode: int, robots: int) -> Room:
-    """Return the random rooms of a training episode, of various contrasts, with obstacles overhead and in motion.
+    """Return the random rooms of a training episode, with contrasts in `CONTRAST_RANGE` and a few obstacles overhead.
 
-    Contrasts are in `CONTRAST_RANGE`. Rooms of low contrast are needed: a navigator trained only in rooms of high
-    contrast learns that little motion means no obstacle, and hardly turns from the single moving edge of a plain wall.
-    Obstacles overhead are needed for table tops and crowns of trees: a navigator that never walked under anything turns
-    round in front of them. Obstacles that move into the way (`scenes.cross_path`) are needed for the trial `dynamic`: a
-    navigator that never met one turns half as far as its teacher. Later starts are free where these have stopped.
+    Rooms of low contrast are needed: a navigator trained only in rooms of high contrast learns that little motion means
+    no obstacle, and hardly turns from the single moving edge of a plain wall. Obstacles overhead are needed for table
+    tops and crowns of trees: a navigator that never walked under anything turns round in front of them.
     """
-    return _training_rooms(jax.random.fold_in(jax.random.key(seed), episode), robots)
-
-
-@partial(jax.jit, static_argnames="robots")
-def _training_rooms(key: Array, robots: int) -> Room:
+    key = jax.random.fold_in(jax.random.key(seed), episode)
     rooms = random_rooms(key, robots)
-    contrast_key, *others = (jax.random.fold_in(key, robots + k) for k in range(4))
+    contrast_key, overhead_key = (jax.random.fold_in(key, robots + k) for k in range(2))
     contrast = jax.random.uniform(contrast_key, (robots,), jnp.float32, *CONTRAST_RANGE)
 
-    def vary(room: Room, contrast: Array, keys: Array) -> Room:
-        raised = scenes.raise_obstacles(scenes.scale_contrast(room.arena, contrast), keys[0], OVERHEAD_SHARE)
-        arena = scenes.cross_path(raised, room.starts[0], keys[1], CROSSING_SHARE)
-        later = sample_free_poses(keys[2], at_time(arena, AT_REST), START_COUNT - 1)
-        return replace(room, arena=arena, starts=jnp.concatenate([room.starts[:1], later]))
+    def vary(arena: Arena, contrast: Array, key: Array) -> Arena:
+        return scenes.raise_obstacles(scenes.scale_contrast(arena, contrast), key, OVERHEAD_SHARE)
 
-    return jax.vmap(vary)(rooms, contrast, jnp.stack([jax.random.split(key, robots) for key in others], axis=1))
+    return replace(rooms, arena=jax.vmap(vary)(rooms.arena, contrast, jax.random.split(overhead_key, robots)))
 
 
 def benchmark_rooms(benchmark: BenchmarkRooms, seed: int, contrast: float = 1.0) -> Room:
