@@ -98,6 +98,7 @@ def _working_folder(parent: Path, *, remove_empty: bool = False) -> Iterator[Pat
         make_folder(parent)
         _remove_abandoned_folders(parent)
         work = parent / f"{checksums.PARTIAL}-{secrets.token_hex(8)}"
+        _lock_of(work).touch()  # filelock would try again for ever, where no file can be made
         lock = FileLock(_lock_of(work)).acquire()  # before the folder: a folder without a lock is abandoned
     except OSError as error:
         raise not_writable(parent, error) from error

@@ -54,6 +54,7 @@ import synthetic
 
 FOLDER = Path(tempfile.mkdtemp(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
 MAX_FRAMES = 20  # read of a video
+PACKAGE = str(paths.PACKAGE_DIR)
 
 Target = Callable[[bytes], object]
 """Reads a file with these bytes."""
@@ -453,8 +454,9 @@ def main() -> None:
             if not str(error).isprintable():
                 _print_new(known, name, content, ("unprintable", error.args[0][:40]))
         except Exception as error:
-            places = [frame for frame in traceback.extract_tb(error.__traceback__) if "lgmdjax" in frame.filename]
-            _print_new(known, name, content, (type(error).__name__, f"{places[-1].filename}:{places[-1].lineno}"))
+            frames = [frame for frame in traceback.extract_tb(error.__traceback__) if PACKAGE in frame.filename]
+            if frames:  # else the harness could not make such a file
+                _print_new(known, name, content, (type(error).__name__, f"{frames[-1].filename}:{frames[-1].lineno}"))
 
     corpus = FOLDER / "corpus"
     corpus.mkdir()
