@@ -1,5 +1,12 @@
+from . import canonical_mjcf as canonical_mjcf
 from . import custom_robot as custom_robot
 from . import hexapod as hexapod
 from . import implicit_step as implicit_step
+from . import leg_frames as leg_frames
+from . import link_shapes as link_shapes
+from . import robot_description as robot_description
+from . import robot_parts as robot_parts
 from . import robot_xml as robot_xml
 from . import servo_faults as servo_faults
+from . import six_legs as six_legs
+from . import stance_check as stance_check

@@ -18,6 +18,7 @@ Source: Cizek & Faigl, "Self-supervised learning of the biologically-inspired ob
 walking robot", fig. 2 and sec. 3.
 """
 
+from copy import deepcopy
 from dataclasses import replace
 
 import jax
@@ -47,6 +48,10 @@ class Params(NotebookTable):
     cpg: cpg.Params
     shaping: shaping.Params
     detector_model: Detector = struct.field(pytree_node=False, default=lgmd)  # of both eyes; hashable, as modules are
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "Params":
+        """Copy the arrays; the detector, a module that Python cannot copy, is the same."""
+        return jax.tree.map(lambda leaf: deepcopy(leaf, memo), self)
 
 
 @struct.dataclass(kw_only=True)

@@ -93,7 +93,7 @@ def generate(params: Params, robot: str) -> dict[str, str]:
 
 
 def _in_comment(text: str) -> str:
-    """Return a text, which may be any file name, so that it can stand in a comment of an ASCII file.
+    r"""Return a text, which may be any file name, so that it can stand in a comment of an ASCII file.
 
     >>> _in_comment("für */ elise")
     'f\\xfcr * / elise'

@@ -4,6 +4,7 @@ from . import fit_gait as fit_gait
 from . import report as report
 from . import report_data as report_data
 from . import report_figures as report_figures
+from . import robot as robot
 from . import scales as scales
 from . import settings as settings
 from . import stages as stages

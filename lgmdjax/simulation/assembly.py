@@ -1,5 +1,6 @@
 """Robots assembled from parameters, from the files of a run, or from those of the package."""
 
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -40,6 +41,16 @@ BASELINES = schema.Object(
     {"gain": schema.Numbers((), -1e9, 1e9), "replayed": schema.Numbers((REPLAY_LENGTH, 2), -10, 10)}
 )
 """Schema of baselines.npz: the gain of policy direct [1/m], and velocities [nominal] of policy random."""
+
+
+NEWER_FIELDS = {
+    r", mounts=None\)": ")",
+    r"Params\[\(None,\)\]": "Params[()]",  # body
+    r", None\)\], \[\]\)": ")], [])",  # mounts of the cameras
+    r"Params\[\((\d+), None\)\]": r"Params[(\1,)]",  # mount of the laser
+    r", None\]\)\)\)$": "])))",  # heading
+}
+"""Patterns of what the structure of a robot says of fields that version 0.2 lacked, and what stood there."""
 
 
 def camera_params(settings: CameraSettings, body: robot_xml.Body | None = None) -> camera.Params:
@@ -304,6 +315,9 @@ def fingerprint(params: closed_loop.Params) -> str:
             structure = structure.replace(repr(model), protocol.identify(model))
     # Not named, so that the fingerprints of walks that were recorded before there was a choice stay the same.
     structure = structure.replace(f"({protocol.identify(lgmd)},)", "()")
+    if params.body is None and params.camera.mounts is None and params.laser.mount is None and params.heading is None:
+        for newer, older in NEWER_FIELDS.items():
+            structure = re.sub(newer, older, structure, count=1)
     return checksums.digest(*leaves, structure.encode())[:16]
 
 
