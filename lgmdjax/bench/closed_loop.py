@@ -19,19 +19,17 @@ The ideal observers `eta` and `tau` are left out. They need size and expansion o
 are in the way at once, and the nearest one changes from frame to frame. The upper bound here is the teacher.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from lgmdjax.bench import cost, worlds
-from lgmdjax.bench.settings import CAMERA_FAULTS, ClosedLoopSettings, Walks
+from lgmdjax.bench import cost, teacher_walks, worlds
+from lgmdjax.bench.settings import CAMERA_FAULTS, ClosedLoopSettings
 from lgmdjax.control import navigator, policies
 from lgmdjax.detectors import protocol
-from lgmdjax.errors import InputError
 from lgmdjax.evaluation import metrics, stimulus_scores
-from lgmdjax.learning import behaviour_cloning, dagger, detector_calibration, detector_responses, lgmd_grid_search
+from lgmdjax.learning import behaviour_cloning, dagger, detector_calibration, detector_responses
 from lgmdjax.runtime import storage
 from lgmdjax.runtime.run_folders import Stage
 from lgmdjax.runtime.storage import JsonObject
@@ -39,7 +37,6 @@ from lgmdjax.simulation import assembly, closed_loop, episodes, recording, reren
 
 OWN = "robot"  # the robot's own LGMD
 WALKS, REFERENCES, SCORES = "walks", "references", "scores"
-CALIBRATION_EPISODE = 2**21  # of rooms that are used nowhere else
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,22 +49,6 @@ class StageSettings:
     source: str = ""  # what distinguishes it from others (`protocol.identify`)
 
 
-def choose(given: Sequence[str]) -> list[str]:
-    """Return the names of the detectors that steer; "all" means all of this package that see, and `OWN`.
-
-    Raises InputError for an unknown one and for an ideal observer, before any work begins.
-    """
-    seeing = [name for name, setup in stimulus_scores.DETECTORS.items() if not setup.is_ideal]
-    names = list(dict.fromkeys(name for each in given for name in ([OWN, *seeing] if each == "all" else [each])))
-    for name in names:
-        if name != OWN and stimulus_scores.get_detector(name).is_ideal:
-            raise InputError(
-                f"expected a detector that sees, got {name}, which is given the geometry of one object; "
-                f"choose from {', '.join([OWN, *seeing])}, or module:attribute"
-            )
-    return names
-
-
 def plan(
     robot: closed_loop.Params, names: Sequence[str], size: ClosedLoopSettings
 ) -> tuple[list[Stage], dict[str, StageSettings]]:
@@ -77,7 +58,7 @@ def plan(
     stages, settings = [Stage(name=WALKS, run=partial(record_walks, robot))], {WALKS: base}
     for name in names:
         source = name if name == OWN else protocol.identify(stimulus_scores.get_detector(name).detector)
-        stages.append(Stage(name=stage_name(name), run=partial(train_and_score, robot), inputs=(WALKS,)))
+        stages.append(Stage(name=teacher_walks.stage_name(name), run=partial(train_and_score, robot), inputs=(WALKS,)))
         settings[stages[-1].name] = replace(base, detector=name, source=source)
     stages.append(Stage(name=REFERENCES, run=partial(score_references, robot)))
     inputs = tuple(stage.name for stage in stages[1:])
@@ -85,37 +66,14 @@ def plan(
     return stages, settings | {REFERENCES: base, SCORES: base}
 
 
-def stage_name(detector: str) -> str:
-    """Return the name of a detector's stage, which is that of its folder.
-
-    >>> stage_name("my_module:detector")
-    'detector-my_module-detector'
-    """
-    return "detector-" + re.sub(r"[^\w.]+", "-", detector).strip("-")
-
-
 def record_walks(
     robot: closed_loop.Params, folder: Path, _: Mapping[str, Path], settings: StageSettings, seed: int
 ) -> None:
     """Record the teacher's walks, without pictures: of the calibration, and the demonstrations of each seed."""
     size = settings.size
-    turning = assembly.with_teacher(robot, lgmd_grid_search.CALIBRATION_RULE)
-    _record_teacher(folder / "calibration", turning, size.calibration, seed, CALIBRATION_EPISODE)
+    teacher_walks.record_turning(folder / "calibration", robot, size.calibration, seed)
     for repeat in range(size.seeds):
-        _record_teacher(folder / f"demonstrations-{repeat}", robot, size.demonstrations, seed + repeat, 0)
-
-
-def _record_teacher(folder: Path, robot: closed_loop.Params, walks: Walks, seed: int, episode: int) -> None:
-    recording.record_rollouts(
-        folder,
-        robot,
-        room_batches.training_rooms(seed, episode, walks.robots),
-        walks.seconds,
-        policies.TEACHER,
-        seed=seed,
-        parameters={"walks": asdict(walks), "episode": episode, "robot": assembly.fingerprint(robot)},
-        label=folder.name,
-    )
+        teacher_walks.record(folder / f"demonstrations-{repeat}", robot, size.demonstrations, seed + repeat, 0)
 
 
 def train_and_score(
@@ -150,9 +108,7 @@ def _calibrate(
     if settings.detector == OWN:
         return robot, []
     setup = stimulus_scores.get_detector(settings.detector)
-    rooms = room_batches.training_rooms(seed, CALIBRATION_EPISODE, settings.size.calibration.robots)
-    record = episodes.stack_walks(episodes.read(walks))
-    pictures = rerender.render_walks(robot.camera, rooms.arena, record)
+    record, pictures = teacher_walks.read_turning(walks, robot, settings.size.calibration, seed)
     return detector_calibration.calibrate(robot, setup.detector, setup.hemifield(), record, pictures)
 
 

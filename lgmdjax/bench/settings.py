@@ -1,10 +1,10 @@
-"""Settings of the comparison in the closed loop, at each scale. Imports no JAX, so that the command line needs none."""
+"""Settings of the comparison in the closed loop, and of the fits, at each scale. Imports no JAX."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lgmdjax.evaluation.settings import BenchScale, TrialName
-from lgmdjax.learning.settings import DaggerSettings
+from lgmdjax.evaluation.settings import STIMULUS_SCALES, BenchScale, StimulusBench, TrialName
+from lgmdjax.learning.settings import DaggerSettings, DetectorFitSettings
 from lgmdjax.sensors.settings import Resolution
 from lgmdjax.simulation.settings import BenchmarkRooms
 from lgmdjax.transfer.names import FaultName
@@ -62,14 +62,55 @@ CLOSED_LOOP_SCALES: Mapping[BenchScale, ClosedLoopSettings] = {
         seeds=1,
     ),
     "full": ClosedLoopSettings(
-        calibration=Walks(robots=16, seconds=30),
-        demonstrations=Walks(robots=16, seconds=60),
-        dagger=DaggerSettings(epochs=100, dagger_rounds=3, round_epochs=60, robots=16, round_seconds=60),
-        benchmark=BenchmarkRooms(eyes=_EYES, robots=32, seconds=120),
-        faults=Walks(robots=32, seconds=60),
-        scenes={"indoor": 6, "outdoor": 6, "dynamic": 6, "gap": 8, "white": 6},
+        calibration=Walks(robots=16, seconds=20),
+        demonstrations=Walks(robots=16, seconds=45),
+        dagger=DaggerSettings(epochs=100, dagger_rounds=2, round_epochs=60, robots=16, round_seconds=45),
+        benchmark=BenchmarkRooms(eyes=_EYES, robots=32, seconds=60),
+        faults=Walks(robots=16, seconds=45),
+        scenes={"indoor": 3, "outdoor": 3, "dynamic": 3, "gap": 4, "white": 3},
         scene_seconds=90,
         seeds=3,
     ),
 }
 """smoke goes through every step, quick compares one navigator of each detector, full three."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitSettings:
+    """Constants of every looming detector fitted by gradient, on recorded walks and on laboratory stimuli."""
+
+    eyes: Resolution  # of the robot that walks
+    walks: Walks
+    windows: int  # stretches of walks in each step
+    stimuli: StimulusBench
+    fit: DetectorFitSettings
+    seeds: int  # splits of the walks
+
+
+FIT_SCALES: Mapping[BenchScale, FitSettings] = {
+    "smoke": FitSettings(
+        eyes=_EYES,
+        walks=Walks(robots=4, seconds=10),
+        windows=2,
+        stimuli=STIMULUS_SCALES["smoke"],
+        fit=DetectorFitSettings(steps=2, eval_every=1, learning_rate=0.05),
+        seeds=1,
+    ),
+    "quick": FitSettings(
+        eyes=_EYES,
+        walks=Walks(robots=16, seconds=20),
+        windows=8,
+        stimuli=STIMULUS_SCALES["quick"],
+        fit=DetectorFitSettings(steps=30, eval_every=6, learning_rate=0.08),
+        seeds=1,
+    ),
+    "full": FitSettings(
+        eyes=_EYES,
+        walks=Walks(robots=32, seconds=20),
+        windows=8,
+        stimuli=STIMULUS_SCALES["quick"],
+        fit=DetectorFitSettings(steps=60, eval_every=10, learning_rate=0.05),
+        seeds=3,
+    ),
+}
+"""smoke goes through every step, quick fits on one split of the walks, full on three."""

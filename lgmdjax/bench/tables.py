@@ -1,14 +1,20 @@
-"""Tables of scores: Markdown for pages, LaTeX for papers, CSV with every number and interval for programs."""
+"""Scores as tables and files: Markdown for pages, LaTeX for papers, CSV with all numbers for programs, JSON, figure."""
 
 import csv
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
 
 from lgmdjax.bench import worlds
 from lgmdjax.bench.settings import CAMERA_FAULTS
 from lgmdjax.evaluation import trials
+from lgmdjax.reporting.figures import style
+from lgmdjax.runtime import partial_files, storage, versions
 from lgmdjax.runtime.storage import JsonObject
 
 ESCAPED = {"\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "<": "$<$"}
@@ -30,6 +36,12 @@ class Table(NamedTuple):
         """
         lines = [self.header, ["---"] * len(self.header), *self.rows]
         return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+    def csv(self) -> str:
+        """Return the table as CSV."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.header, *self.rows])
+        return text.getvalue()
 
     def latex(self, caption: str) -> str:
         """Return the table for LaTeX with the package booktabs.
@@ -55,18 +67,71 @@ class Table(NamedTuple):
         )
 
 
+class Results(NamedTuple):
+    """What a benchmark writes."""
+
+    rows: Sequence[JsonObject]  # scores, one of each detector
+    table: Table
+    figure: Figure
+    caption: str
+    settings: Any  # a dataclass
+
+
+def write(folder: Path, results: Results, seed: int) -> list[Path]:
+    """Write results into a folder, in every format; return the files."""
+    with partial_files.replacing_all(folder) as partial:
+        names = write_into(partial, results, seed)
+    return [folder / name for name in names]
+
+
+def write_into(folder: Path, results: Results, seed: int) -> list[str]:
+    """Write results into a folder that is being made; return the names of the files."""
+    texts = {
+        "scores.md": results.table.markdown(),
+        "scores.tex": results.table.latex(results.caption),
+        "scores.csv": to_csv(results.rows),
+    }
+    storage.write_json(folder / "scores.json", facts(results.rows, results.settings, seed))
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "scores.png").write_bytes(style.to_png(results.figure))
+    return [*texts, "scores.json", "scores.png"]
+
+
+def facts(rows: Sequence[JsonObject], settings: Any, seed: int) -> JsonObject:
+    """Return the content of scores.json: rows, and what they were made with."""
+    return {"settings": asdict(settings), "seed": seed, "versions": versions.installed(), "rows": rows}
+
+
+def fits(rows: Sequence[JsonObject]) -> Table:
+    """Return the table of the fits; rows as in its scores.json."""
+    steps = list(rows[0]["stimuli"]["scores"])
+    header = ["detector", *(f"walks: r, {step}" for step in steps), *(f"stimuli: AUC, {step}" for step in steps)]
+    return Table(
+        header,
+        [
+            [
+                row["detector"],
+                *(estimate(row["walks"]["scores"][step], 2) for step in steps),
+                *(number(row["stimuli"]["scores"][step], 2) for step in steps),
+            ]
+            for row in rows
+        ],
+    )
+
+
 def closed_loop(rows: Sequence[JsonObject]) -> Table:
     """Return the table of the closed loop; rows as in its scores.json."""
     scenes = list(rows[0][worlds.SCENES])
     header = [
         "detector", "collisions / 100 m", "coverage [1/min]", "hard turning",
-        *(f"{scene} {_outcome(scene)}" for scene in scenes),
+        *(f"{scene} {outcome(scene)}" for scene in scenes),
         *(f"{world}: collisions / 100 m, coverage" for world in CAMERA_FAULTS), "r of turns", "us a frame",
     ]  # fmt: skip
     return Table(header, [[*_cells(row, scenes)] for row in rows])
 
 
-def _outcome(scene: str) -> str:
+def outcome(scene: str) -> str:
     """Return what counts as success in a scene: whether there is anything to pass."""
     return "passed" if math.isfinite(trials.TRIALS[scene].beyond) else "untouched"
 
@@ -78,8 +143,8 @@ def _cells(row: JsonObject, scenes: Sequence[str]) -> Iterator[str]:
     yield estimate(rooms["progress"]["coverage"], 1)
     yield f"{100 * rooms['progress']['hard_turning']['value']:.0f} %"
     for scene in scenes:
-        outcome = row[worlds.SCENES][scene]
-        yield f"{outcome[_outcome(scene)]} of {outcome['robots']}"
+        found = row[worlds.SCENES][scene]
+        yield f"{found[outcome(scene)]} of {found['robots']}"
     for world in CAMERA_FAULTS:
         faulty = row.get(world)
         yield (
@@ -95,11 +160,11 @@ def _cells(row: JsonObject, scenes: Sequence[str]) -> Iterator[str]:
 def estimate(value: Mapping[str, float | None], digits: int) -> str:
     """Return an estimate with its interval.
 
-    >>> estimate({"value": 2.22, "low": 0.27, "high": 8.03}, 1)
-    '2.2 (0.3 to 8.0)'
+    >>> estimate({"value": 2.22, "low": 0.27, "high": 8.03}, 1), estimate({"value": 2.0, "low": None, "high": None}, 0)
+    ('2.2 (0.3 to 8.0)', '2')
     """
     middle, low, high = (number(value[name], digits) for name in ("value", "low", "high"))
-    return f"{middle} ({low} to {high})"
+    return middle if low == "-" else f"{middle} ({low} to {high})"
 
 
 def number(value: float | None, digits: int) -> str:

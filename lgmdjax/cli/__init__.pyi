@@ -1,5 +1,7 @@
+from . import bench_all as bench_all
 from . import bench_clips as bench_clips
 from . import bench_closed_loop as bench_closed_loop
+from . import bench_fit as bench_fit
 from . import bench_stimuli as bench_stimuli
 from . import calibrate_camera as calibrate_camera
 from . import doctor as doctor

@@ -6,7 +6,8 @@ Writes to a folder with the name of the clips' folder:
 | ------------- | ----------------------------------------------------------------------------- |
 | index.html    | tables, ROC, and the responses to every clip below its pictures               |
 | scores.md     | the tables as Markdown                                                        |
-| scores.json   | all scores, with the settings and the onsets of the alarms                    |
+| scores.json   | all scores, with the settings and the onsets of the alarms, and versions      |
+| roc.png       | hits against false alarms for every threshold                                 |
 | responses.csv | u, excitation, adapted response and whole-field change of every frame         |
 """
 
@@ -19,6 +20,7 @@ import pyarrow as pa
 import pyarrow.csv
 from tqdm import tqdm
 
+from lgmdjax.bench.tables import Table
 from lgmdjax.cli.flags import AlarmFlags, BenchFlags
 from lgmdjax.detectors import alarm
 from lgmdjax.errors import InputError, one_line
@@ -42,8 +44,8 @@ Traces = Mapping[str, Sequence[Trace]]
 
 def run_clips(flags: BenchFlags) -> Iterator[str]:
     """Score the detectors; yield a line about each, then the names of the files."""
-    folder, labels = _read_arguments(flags.paths)
-    names = _choose(flags.detector)
+    folder, labels = read_arguments(flags.paths)
+    names = stimulus_scores.choose_seeing(flags.detector)
     clips = [clip_responses.read_clip(folder, label) for label in tqdm(labels, desc="read", unit="clip")]
     traces: dict[str, list[Trace]] = {}
     rows: list[JsonObject] = []
@@ -52,18 +54,24 @@ def run_clips(flags: BenchFlags) -> Iterator[str]:
         traces[name] = [clip_responses.respond(contestant, clip) for clip in clips]
         rows.append(score(name, clips, traces[name]))
         yield _line(rows[-1])
-    out = flags.out / f"clips-{folder.resolve().name}"
+    out = folder_of(flags)
     with partial_files.replacing_all(out) as partial:
-        storage.write_json(partial / "scores.json", rows)
-        (partial / "scores.md").write_text(table(rows), encoding="utf-8")
+        storage.write_json(partial / "scores.json", {"versions": versions.installed(), "rows": rows})
+        (partial / "roc.png").write_bytes(style.to_png(figure.plot_roc(rows)))
+        (partial / "scores.md").write_text(table(rows).markdown(), encoding="utf-8")
         with (partial / "responses.csv").open("wb") as file:
             pyarrow.csv.write_csv(_tabulate(clips, traces), file)
         (partial / "index.html").write_text(_page(clips, rows, traces), encoding="utf-8")
-    for written in ("index.html", "scores.md", "scores.json", "responses.csv"):
+    for written in ("index.html", "scores.md", "scores.json", "roc.png", "responses.csv"):
         yield str(out / written)
 
 
-def _read_arguments(paths: Sequence[Path]) -> tuple[Path, list[Label]]:
+def folder_of(flags: BenchFlags) -> Path:
+    """Return the folder of the results."""
+    return flags.out / f"clips-{flags.paths[0].resolve().name}"
+
+
+def read_arguments(paths: Sequence[Path]) -> tuple[Path, list[Label]]:
     """Return the folder of the clips and their labels; note on stderr which videos have none."""
     if not 1 <= len(paths) <= 2:
         raise InputError(f"expected bench clips FOLDER [labels.csv], got {len(paths)} paths; name a folder of videos")
@@ -83,19 +91,6 @@ def _read_arguments(paths: Sequence[Path]) -> tuple[Path, list[Label]]:
         note = f"note: clips of kind {', '.join(unusual)} should raise no alarm; check the spelling"
         print(one_line(note), file=sys.stderr)
     return folder, labels
-
-
-def _choose(given: Sequence[str]) -> list[str]:
-    """Return the names of the detectors; refuse wrong ones before the work begins."""
-    seeing = [name for name, each in stimulus_scores.DETECTORS.items() if not each.is_ideal]
-    names = list(dict.fromkeys(name for each in given for name in (seeing if each == "all" else [each])))
-    for name in names:
-        if stimulus_scores.get_detector(name).is_ideal:
-            choices = ", ".join(seeing)
-            raise InputError(
-                f"expected detectors of frames, got {name}, which is given the geometry; choose from {choices}"
-            )
-    return names
 
 
 def score(name: str, clips: Sequence[Clip], traces: Sequence[Trace]) -> JsonObject:
@@ -121,10 +116,9 @@ def _line(row: JsonObject) -> str:
     )
 
 
-def table(rows: Sequence[JsonObject]) -> str:
-    """Return the scores as a Markdown table, a row for each detector; alarms on the adapted response, leave-one-out."""
-    lines = [COLUMNS, ("---",) * len(COLUMNS), *(_cells(row) for row in rows)]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+def table(rows: Sequence[JsonObject]) -> Table:
+    """Return the scores as a table, a row for each detector; alarms on the adapted response, leave-one-out."""
+    return Table(COLUMNS, [_cells(row) for row in rows])
 
 
 def _cells(row: JsonObject) -> tuple[str, ...]:

@@ -9,29 +9,25 @@ Writes a run folder, closed-loop-<scale>, with a folder for each stage (`lgmdjax
 | scores.png              | collisions, coverage and hard turning of every detector                |
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
-from pathlib import Path
+from collections.abc import Iterator
 
 from lgmdjax.bench import closed_loop, tables, worlds
-from lgmdjax.bench.settings import CAMERA_FAULTS, CLOSED_LOOP_SCALES, ClosedLoopSettings
+from lgmdjax.bench.settings import CAMERA_FAULTS, CLOSED_LOOP_SCALES
 from lgmdjax.cli.flags import BenchFlags
 from lgmdjax.errors import InputError
-from lgmdjax.reporting.figures import detector_walks, style
-from lgmdjax.runtime import partial_files, run_folders, storage, versions
-from lgmdjax.runtime.storage import JsonObject
+from lgmdjax.evaluation import stimulus_scores
+from lgmdjax.reporting.figures import detector_walks
+from lgmdjax.runtime import run_folders, storage
 from lgmdjax.simulation import assembly
+from lgmdjax.simulation.closed_loop import Params
 
 CAPTION = "Looming detectors that steer the same robot, with navigators trained in the same way."
 
 
 def run_closed_loop(flags: BenchFlags) -> Iterator[str]:
     """Run the comparison, or resume it; yield a line about each detector, then the names of the files."""
-    if flags.paths:
-        raise InputError(f"expected no paths after bench {flags.on}, got {flags.paths[0]}; only bench clips has some")
-    names, size = closed_loop.choose(flags.detector), CLOSED_LOOP_SCALES[flags.scale]
-    robot = assembly.load_robot(flags.run / "fit-gait", flags.run / "train") if flags.run else assembly.load_robot()
-    stages, settings = closed_loop.plan(robot, names, size)
+    names, size = stimulus_scores.choose_seeing(flags.detector, [closed_loop.OWN]), CLOSED_LOOP_SCALES[flags.scale]
+    stages, settings = closed_loop.plan(load_robot(flags), names, size)
     name, remedy = f"closed-loop-{flags.scale}", "choose another --out"
     run = run_folders.open_run(flags.out, name, flags.scale, flags.seed, settings, remedy=remedy)
     rows = storage.read_json(run_folders.execute(run, stages, closed_loop.SCORES) / "scores.json")
@@ -41,19 +37,15 @@ def run_closed_loop(flags: BenchFlags) -> Iterator[str]:
             f"{row['detector']}: collisions per 100 m {tables.estimate(rooms['per_100_m'], 1)}, "
             f"coverage {tables.estimate(rooms['progress']['coverage'], 1)} / min"
         )
-    for file in write(run.folder, rows, size, flags.seed):
+    figure = detector_walks.plot(rows, (worlds.ROOMS, *CAMERA_FAULTS))
+    for file in tables.write(
+        run.folder, tables.Results(rows, tables.closed_loop(rows), figure, CAPTION, size), flags.seed
+    ):
         yield str(file)
 
 
-def write(folder: Path, rows: Sequence[JsonObject], size: ClosedLoopSettings, seed: int) -> list[Path]:
-    """Write tables and figure into a folder; return the files."""
-    facts = {"settings": asdict(size), "seed": seed, "versions": versions.installed(), "rows": rows}
-    table = tables.closed_loop(rows)
-    texts = {"scores.md": table.markdown(), "scores.tex": table.latex(CAPTION), "scores.csv": tables.to_csv(rows)}
-    figure = detector_walks.plot(rows, (worlds.ROOMS, *CAMERA_FAULTS))
-    with partial_files.replacing_all(folder) as partial:
-        storage.write_json(partial / "scores.json", facts)
-        (partial / "scores.png").write_bytes(style.to_png(figure))
-        for name, text in texts.items():
-            (partial / name).write_text(text, encoding="utf-8")
-    return [folder / name for name in (*texts, "scores.json", "scores.png")]
+def load_robot(flags: BenchFlags) -> Params:
+    """Return the robot that walks: that of a run folder, or the pretrained one. Raises InputError for paths."""
+    if flags.paths:
+        raise InputError(f"expected no paths after bench {flags.on}, got {flags.paths[0]}; only bench clips has some")
+    return assembly.load_robot(flags.run / "fit-gait", flags.run / "train") if flags.run else assembly.load_robot()

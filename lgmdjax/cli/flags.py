@@ -156,11 +156,11 @@ class WatchFlags:
 class BenchFlags:
     """What the detectors are compared on, and which."""
 
-    on: tyro.conf.Positional[Literal["stimuli", "clips", "closed-loop"]]
-    """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos; closed-loop: walks of
-    the robot that they steer"""
+    on: tyro.conf.Positional[Literal["stimuli", "clips", "fit", "closed-loop", "all"]]
+    """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos; fit: their constants
+    fitted by gradient; closed-loop: walks of the robot that they steer; all: all of these, on one page"""
     paths: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """with clips, the folder of the videos, and the file of their labels if it is not labels.csv in that folder"""
+    """with clips and all, the folder of the videos, and the file of their labels if that is not labels.csv in it"""
     detector: tuple[str, ...] = ("all",)
     """detectors by name, or module:attribute for one of your own; all means those of lgmdjax.detectors"""
     scale: BenchScale = "quick"

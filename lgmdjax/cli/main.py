@@ -183,16 +183,15 @@ def sim_robot(arguments: Sequence[str]) -> None:
 
 
 def bench(arguments: Sequence[str]) -> None:
-    """Compare looming detectors on laboratory stimuli, on labelled videos, or as the eyes of the robot."""
+    """Compare looming detectors on stimuli, on labelled videos, after a fit, and as the eyes of the robot."""
     from lgmdjax.cli import flags
 
     given = flags.parse_bench(_summary(bench), arguments)
     environment.check_jax()
-    from lgmdjax.cli.bench_clips import run_clips
-    from lgmdjax.cli.bench_closed_loop import run_closed_loop
-    from lgmdjax.cli.bench_stimuli import run_stimuli
+    from lgmdjax.cli import bench_all
 
-    for line in {"stimuli": run_stimuli, "clips": run_clips, "closed-loop": run_closed_loop}[given.on](given):
+    run = bench_all.run_all if given.on == "all" else bench_all.BENCHMARKS[given.on].run
+    for line in run(given):
         print(line, flush=True)
 
 

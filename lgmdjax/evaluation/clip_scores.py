@@ -23,7 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import stats
 
 from lgmdjax.detectors import alarm
 from lgmdjax.errors import InputError
@@ -242,7 +241,7 @@ def area(series: Sequence[Series]) -> float | None:
     positive, negative = largest(_windows), largest(_stretches)
     if not positive or not negative:
         return None
-    return float(stats.mannwhitneyu(positive, negative).statistic) / (len(positive) * len(negative))
+    return metrics.area_under_roc(positive, negative)
 
 
 def _windows(series: Series) -> list[np.ndarray]:

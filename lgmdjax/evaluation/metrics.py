@@ -255,6 +255,15 @@ def student_mean(values: Sequence[float]) -> Estimate:
     return Estimate(value=mean, low=mean - half, high=mean + half)
 
 
+def area_under_roc(positive: Sequence[float] | ndarray, negative: Sequence[float] | ndarray) -> float:
+    """Return how often a positive is above a negative, ties counted half.
+
+    >>> area_under_roc([1.0, 2.0], [0.0, 1.0])
+    0.875
+    """
+    return float(stats.mannwhitneyu(positive, negative).statistic) / (len(positive) * len(negative))
+
+
 def _average_over_cycle(series: Float[ndarray, "frames *components"], cycle_time: float) -> ndarray:
     """Average over one gait cycle; the end values are repeated, which shortens a path by at most half a cycle."""
     return ndimage.uniform_filter1d(series, round(cycle_time * FRAME_RATE), axis=0, mode="nearest")

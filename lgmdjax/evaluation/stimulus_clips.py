@@ -21,9 +21,6 @@ from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.evaluation.settings import StimulusBench
 from lgmdjax.sensors import camera, stimuli
 
-L_OVER_V = (0.03, 0.1, 0.3)  # s, of the approaches and recessions to distinguish
-RATES = (0.25, 0.5, 1.0, 2.0)  # rad/s, of translation
-HALF_ANGLE = 0.3  # rad, of the square that translates; half of it is the half height of the bar
 CONTRASTS = (1.0, 0.5, 0.2, 0.1)  # of an approach with the middle l/|v|
 NOISE = (2.0, 5.0, 10.0, 20.0)  # grey, standard deviation
 SECONDS, HOLD = 2.0, 0.2  # duration of a clip, and of what follows contact [s]
@@ -35,6 +32,28 @@ Clip = tuple[str, Any, Geometry]
 """Name, frames, geometry."""
 
 
+class Motions(NamedTuple):
+    """Sizes and speeds of the stimuli that are to be distinguished."""
+
+    l_over_v: tuple[float, float, float] = (0.03, 0.1, 0.3)  # of approaches and recessions [s]
+    rates: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)  # of translation [rad/s]
+    half_angle: float = 0.3  # of the square that translates; half of it is the half height of the bar [rad]
+    grating: tuple[float, float] = (0.5, 0.5)  # period [rad] and rate [rad/s]
+    yaw: float = 0.5  # rad/s
+    sway: tuple[float, float] = (0.1, 0.8)  # amplitude [rad] and period [s]
+
+
+SCORED = Motions()  # those of `lgmdjax bench stimuli`
+OTHER = Motions(
+    l_over_v=(0.05, 0.15, 0.4),
+    rates=(0.35, 0.7, 1.4, 2.8),
+    half_angle=0.4,
+    grating=(0.7, 0.8),
+    yaw=0.8,
+    sway=(0.15, 1.1),
+)  # the same kinds of motion, for a fit that is scored on the others
+
+
 class Clips(NamedTuple):
     """Clips of one length, each with a name."""
 
@@ -44,11 +63,11 @@ class Clips(NamedTuple):
     time: Float[np.ndarray, "frames"]  # from contact in clips that approach, negative before it [s]
 
 
-def selection(settings: StimulusBench) -> Clips:
+def selection(settings: StimulusBench, motions: Motions = SCORED) -> Clips:
     """Return a clip of every stimulus."""
     eye = camera.Params(width=settings.width, height=settings.height)
     time = _times(settings, SECONDS - HOLD)
-    middle = L_OVER_V[1]
+    middle, width = motions.l_over_v[1], motions.half_angle
     looms, nothing = approach_geometry(middle, time), _nothing(time)
 
     def clip(name: str, geometry: Geometry, stimulus: Stimulus, *values: float) -> Clip:
@@ -56,12 +75,12 @@ def selection(settings: StimulusBench) -> Clips:
 
     return _stack(
         [
-            *(each for l_over_v in L_OVER_V for each in _looming(eye, l_over_v, time)),
-            *(clip(f"translate {r:g} rad/s", nothing, stimuli.translation, HALF_ANGLE, r) for r in RATES),
-            clip("elongate", looms, stimuli.elongation, 0.5 * HALF_ANGLE, middle),
-            clip("grating", nothing, stimuli.grating, 0.5, 0.5),
-            clip("yaw", nothing, stimuli.yaw, 0.5),
-            clip("sway", nothing, stimuli.roll, 0.1, 0.8),
+            *(each for l_over_v in motions.l_over_v for each in _looming(eye, l_over_v, time)),
+            *(clip(f"translate {r:g} rad/s", nothing, stimuli.translation, width, r) for r in motions.rates),
+            clip("elongate", looms, stimuli.elongation, 0.5 * width, middle),
+            clip("grating", nothing, stimuli.grating, *motions.grating),
+            clip("yaw", nothing, stimuli.yaw, motions.yaw),
+            clip("sway", nothing, stimuli.roll, *motions.sway),
             ("flash", _render(stimuli.flash, eye, jnp.asarray(time + 0.5 * SECONDS, float)), nothing),
             clip("approach textured", looms, stimuli.textured_approach, middle),
         ],
@@ -121,7 +140,7 @@ def _looming(eye: camera.Params, l_over_v: float, time: Float[np.ndarray, "frame
 def _plain_approach(settings: StimulusBench) -> tuple[np.ndarray, Geometry, np.ndarray]:
     eye = camera.Params(width=settings.width, height=settings.height)
     time = _times(settings, SECONDS - HOLD)
-    return *_approach(eye, L_OVER_V[1], time), time
+    return *_approach(eye, SCORED.l_over_v[1], time), time
 
 
 def _times(settings: StimulusBench, before: float) -> Float[np.ndarray, "frames"]:

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
-from scipy import stats
 
 from lgmdjax.detectors import (
     d_lgmd,
@@ -39,7 +38,7 @@ from lgmdjax.detectors import (
     tau,
 )
 from lgmdjax.errors import InputError
-from lgmdjax.evaluation import stimulus_clips
+from lgmdjax.evaluation import metrics, stimulus_clips
 from lgmdjax.evaluation.settings import StimulusBench
 from lgmdjax.evaluation.stimulus_clips import CONTRASTS, NOISE, Clips
 from lgmdjax.runtime import user_objects
@@ -116,6 +115,22 @@ def get_detector(name: str) -> DetectorSetup:
     return _published(detector)
 
 
+def choose_seeing(given: Sequence[str], own: Sequence[str] = ()) -> list[str]:
+    """Return the names of detectors that see pictures; "all" means all of this package, after those in `own`.
+
+    Raises InputError for an unknown one and for an ideal observer, before any work begins.
+    """
+    seeing = [*own, *(name for name, setup in DETECTORS.items() if not setup.is_ideal)]
+    names = list(dict.fromkeys(name for each in given for name in (seeing if each == "all" else [each])))
+    for name in names:
+        if name not in own and get_detector(name).is_ideal:
+            raise InputError(
+                f"expected a detector that sees, got {name}, which is given the geometry of one object; "
+                f"choose from {', '.join(seeing)}, or module:attribute"
+            )
+    return names
+
+
 def render_clips(settings: StimulusBench, seed: int) -> StimulusClips:
     """Render all clips."""
     return StimulusClips(
@@ -184,8 +199,8 @@ def compare(peaks: Mapping[str, float]) -> JsonObject:
     selectivity = {name: peak / mean if mean > SILENT else None for name, peak in peaks.items()}
     return {
         "selectivity": selectivity,
-        "auc_dark": _area(dark + textured, others),
-        "auc_bright": _area(bright, others),
+        "auc_dark": metrics.area_under_roc(dark + textured, others),
+        "auc_bright": metrics.area_under_roc(bright, others),
     }
 
 
@@ -210,8 +225,3 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float | None]:
 
 def _matching(peaks: Mapping[str, float], kind: str) -> list[float]:
     return [peak for name, peak in peaks.items() if name.startswith(kind)]
-
-
-def _area(positive: Sequence[float], negative: Sequence[float]) -> float:
-    """Return the area under ROC: how often a positive is above a negative, ties counted half."""
-    return float(stats.mannwhitneyu(positive, negative).statistic) / (len(positive) * len(negative))

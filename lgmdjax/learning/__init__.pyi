@@ -2,6 +2,8 @@ from . import behaviour_cloning as behaviour_cloning
 from . import checkpoints as checkpoints
 from . import dagger as dagger
 from . import detector_calibration as detector_calibration
+from . import detector_fit as detector_fit
+from . import detector_objectives as detector_objectives
 from . import detector_responses as detector_responses
 from . import finetuning as finetuning
 from . import gait_objective as gait_objective

@@ -25,7 +25,7 @@ from dataclasses import asdict, dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, PyTree
+from jaxtyping import Bool, Float, PyTree
 from scipy import ndimage
 from tqdm.auto import tqdm
 
@@ -134,6 +134,14 @@ def judge(
         return Candidate(*pair, gain=1.0, suppression=suppression, score=NO_RESPONSE)
     gain = float(scaled.logit(jnp.asarray(FULL, float))) / level
     u = np.asarray(scaled.expand(jnp.asarray(response.u), gain))
+    return Candidate(*pair, gain=gain, suppression=suppression, score=agreement(u, record))
+
+
+def agreement(u: Float[np.ndarray, "robots frames 2"], record: Record) -> float:
+    """Return the correlation of u_left - u_right, averaged over a gait cycle, with that of proximity.
+
+    Only steady walking counts.
+    """
+    steady = lgmd_grid_search.is_steady_walking(record)
     averaged = ndimage.uniform_filter1d(u, round(AVERAGING_TIME * FRAME_RATE), axis=1)[steady]
-    score = lgmd_grid_search.correlations(averaged, 1 / np.asarray(record.distances)[steady])["score"]
-    return Candidate(*pair, gain=gain, suppression=suppression, score=score)
+    return lgmd_grid_search.correlations(averaged, 1 / np.asarray(record.distances)[steady])["score"]

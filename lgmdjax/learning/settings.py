@@ -41,3 +41,12 @@ class LgmdGradientSettings:
     learning_rate: float  # initial learning rate of the detector's constants; decays to zero along half a cosine
     navigator_learning_rate: float  # initial learning rate of the navigator's weights; decays likewise
     seeds: int  # number of repeats, each with its own seed
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorFitSettings:
+    """Fit of any looming detector's constants by gradient."""
+
+    steps: int  # number of optimiser steps
+    eval_every: int  # number of steps between two evaluations
+    learning_rate: float  # initial learning rate of the logarithms of the constants; decays along half a cosine

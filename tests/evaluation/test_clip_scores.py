@@ -179,7 +179,7 @@ def test_the_command_writes_page_tables_and_responses(folder, tmp_path, capsys):
     assert "note: no label for e.mp4" in told.err and "note: clips of kind shrinks" in told.err
     out = tmp_path / f"clips-{folder.name}"
     assert told.out.split("\n")[1] == str(out / "index.html")
-    (row,) = json.loads((out / "scores.json").read_text())
+    (row,) = json.loads((out / "scores.json").read_text())["rows"]
     assert row["detector"] == "test_clip_scores:change" and row["clips"] == ["a.mp4", "b.mp4", "c.mp4", HOSTILE]
     assert row["adapted"]["auc"] == 1 and row["adapted"]["fixed"]["hits"] == 2
     assert row["adapted"]["fixed"]["false_alarms"] == 0 and row["adapted"]["leave_one_out"]["hits"] == 2

@@ -79,7 +79,7 @@ def test_the_command_writes_table_json_and_figure(tmp_path, capsys):
     out = ["--out", str(tmp_path), "--scale", "smoke"]
     assert main.main(["bench", "stimuli", "--detector", "tau", "test_stimulus_scores:darkness", *out]) == 0
     folder = tmp_path / "stimuli-smoke"
-    rows = json.loads((folder / "scores.json").read_text())
+    rows = json.loads((folder / "scores.json").read_text())["rows"]
     assert [row["detector"] for row in rows] == ["tau", "test_stimulus_scores:darkness"]
     assert (folder / "scores.md").read_text().count("\n") == 4
     assert (folder / "scores.png").read_bytes().startswith(b"\x89PNG")

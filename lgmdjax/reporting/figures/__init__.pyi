@@ -1,6 +1,7 @@
 from . import clip_scores as clip_scores
 from . import comparison as comparison
 from . import detection as detection
+from . import detector_fits as detector_fits
 from . import detector_walks as detector_walks
 from . import learning as learning
 from . import locomotion as locomotion
