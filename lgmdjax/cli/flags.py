@@ -156,7 +156,7 @@ class WatchFlags:
 class BenchFlags:
     """What the detectors are compared on, and which."""
 
-    on: tyro.conf.Positional[Literal["stimuli", "clips", "fit", "closed-loop", "all"]]
+    on: tyro.conf.Positional[Literal["stimuli", "clips", "fit", "closed-loop", "all"]] = "stimuli"
     """stimuli: laboratory stimuli, from approach to a flash of light; clips: labelled videos; fit: their constants
     fitted by gradient; closed-loop: walks of the robot that they steer; all: all of these, on one page"""
     paths: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -164,8 +164,8 @@ class BenchFlags:
     detector: tuple[str, ...] = ("all",)
     """detectors by name, or module:attribute for one of your own; all means those of lgmdjax.detectors"""
     scale: BenchScale = "quick"
-    """smoke goes through every step; quick takes a minute, in the closed loop half an hour; full has l/|v| from 10 ms
-    to 2 s, and three navigators for each detector in the closed loop"""
+    """smoke goes through every step; quick takes minutes, in the closed loop half an hour; full has l/|v| from 10 ms
+    to 2 s, and three splits and navigators for each detector in fit and closed loop"""
     seed: int = 0
     """seed of the noise, the rooms and the training"""
     run: Path | None = None
@@ -332,7 +332,7 @@ def parse_watch(description: str, arguments: Sequence[str]) -> WatchFlags:
 
 def parse_bench(description: str, arguments: Sequence[str]) -> BenchFlags:
     """Read the flags of command bench."""
-    return parse(BenchFlags(on=tyro.MISSING), "bench", description, arguments)
+    return parse(BenchFlags(), "bench", description, arguments)
 
 
 def parse_sweep(description: str, arguments: Sequence[str]) -> SweepFlags:

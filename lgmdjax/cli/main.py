@@ -22,9 +22,9 @@ from lgmdjax.runtime.jax_setup import collect_garbage_rarely, prepare_jax, prepa
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
 NOT_RESUMED = (
-    "watch", "export", "export-dataset", "drive", "calibrate-camera", "servos", "sim-robot", "bench", "demo", "view",
-    "doctor",
+    "watch", "export", "export-dataset", "drive", "calibrate-camera", "servos", "sim-robot", "demo", "view", "doctor",
 )  # fmt: skip
+RESUMED_BENCHMARKS = ("fit", "closed-loop", "all")
 ALARM_CODE = 3  # exit code of `lgmdjax watch --alarm.exit-code` after an alarm
 MIN_COLUMNS, MAX_COLUMNS = 40, 400  # of help; tyro does not terminate in narrower terminals
 DESCRIPTION = "A hexapod robot that avoids obstacles with two looming detectors (LGMD) and a learned controller."
@@ -267,7 +267,18 @@ STUDIES: Mapping[str, str] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    return exit_code(lambda: _run(given), RESTARTS if given[:1] and given[0] in NOT_RESUMED else RESUMES)
+    return exit_code(lambda: _run(given), RESUMES if resumes(given) else RESTARTS)
+
+
+def resumes(given: Sequence[str]) -> bool:
+    """Return whether a command resumes after an interruption, rather than start again.
+
+    >>> resumes(["bench", "stimuli"]), resumes(["bench", "fit"]), resumes(["trial", "tube"])
+    (False, True, True)
+    """
+    if given[:1] == ["bench"]:
+        return any(word in RESUMED_BENCHMARKS for word in given[1:])
+    return not (given and given[0] in NOT_RESUMED)
 
 
 def exit_code(command: Callable[[], int | None], afterwards: str = RESUMES) -> int:
