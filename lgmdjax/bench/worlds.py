@@ -9,7 +9,6 @@
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +18,9 @@ from lgmdjax.bench.settings import CAMERA_FAULTS, ClosedLoopSettings
 from lgmdjax.evaluation import run_trial, trials
 from lgmdjax.evaluation.settings import TrialName
 from lgmdjax.runtime.storage import JsonObject
-from lgmdjax.simulation import faulty_cameras, room_batches
+from lgmdjax.simulation import room_batches
 from lgmdjax.simulation.closed_loop import FRAME_RATE, Record, Room
-from lgmdjax.transfer import faults
-from lgmdjax.transfer.names import FaultName
+from lgmdjax.transfer import randomisation
 
 ROOMS, SCENES = "rooms", "scenes"
 WORLDS = (ROOMS, *CAMERA_FAULTS, SCENES)
@@ -37,21 +35,7 @@ def sample(world: str, settings: ClosedLoopSettings, seed: int) -> tuple[Room, f
     if world == ROOMS:
         return rooms, settings.benchmark.seconds
     some = jax.tree.map(lambda leaf: leaf[: settings.faults.robots], rooms)
-    return with_faults(some, CAMERA_FAULTS[world]), settings.faults.seconds
-
-
-def with_faults(rooms: Room, names: Sequence[FaultName]) -> Room:
-    """Return rooms whose robots have faulty cameras, each drawn with the room's key."""
-    keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(rooms.key, 1)
-    drawn = [faults.draw(key, *names).camera for key in keys]
-    for one in drawn:
-        faulty_cameras.check(one)
-    stacked = jax.tree.map(lambda *leaves: _array(np.stack([np.asarray(leaf) for leaf in leaves])), *drawn)
-    return replace(rooms, faults=stacked)
-
-
-def _array(values: np.ndarray) -> jax.Array:
-    return jnp.asarray(values, jnp.int32 if values.dtype.kind == "i" else float)
+    return randomisation.randomise_cameras(some, CAMERA_FAULTS[world]), settings.faults.seconds
 
 
 def split_scenes(record: Record, scenes: Mapping[TrialName, int]) -> dict[str, Record]:

@@ -26,6 +26,8 @@ from lgmdjax.locomotion import cpg
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, room_batches
 from lgmdjax.simulation.episodes import Walk
+from lgmdjax.transfer import randomisation
+from lgmdjax.transfer.names import FaultName
 
 FIRST_LEARNER_EPISODE = 2**19  # number of the first DAgger round's episode; its rooms are in no other episode
 TURN_GAIN_EPISODE = 2**20  # number of the episode in whose rooms turn gains are compared
@@ -83,6 +85,7 @@ def run(
     seed: int,
     *,
     variant: names.Variant = "lstm",
+    camera_faults: Sequence[FaultName] = (),
 ) -> list[Walk]:
     """Alternate fits and rollouts; return the given walks and those of all rounds.
 
@@ -93,9 +96,12 @@ def run(
         settings: number and size of the rounds.
         seed: of rooms, initial weights and the split.
         variant: of the navigator.
+        camera_faults: that the robots may have.
     """
     for number in range(settings.dagger_rounds):
-        walks = walks + _run_round(folder, robot, walks, settings, seed=seed, number=number, variant=variant)
+        walks = walks + _run_round(
+            folder, robot, walks, settings, seed=seed, number=number, variant=variant, camera_faults=camera_faults
+        )
     return walks
 
 
@@ -107,6 +113,7 @@ def select_turn_gain(
     settings: TrainSettings,
     *,
     seed: int,
+    camera_faults: Sequence[FaultName] = (),
 ) -> tuple[navigator.Params, list[JsonObject]]:
     """Choose the turn gain with the fewest approaches per distance; the smallest gain if several have equally few.
 
@@ -121,6 +128,7 @@ def select_turn_gain(
         settings: the gains, and how many robots walk for how long with each. Without gains no robot walks, and
             `TURN_GAIN` holds.
         seed: of the rooms.
+        camera_faults: that the robots may have.
 
     Returns:
         The rescaled navigator, and a row per gain, as the stage `train` stores it: `caution` (the gain), `chosen`,
@@ -130,10 +138,13 @@ def select_turn_gain(
         row = {"caution": behaviour_cloning.TURN_GAIN, "chosen": True}
         return behaviour_cloning.rescale_turns(fit.best, test), [row]
     rooms = room_batches.random_rooms(jax.random.fold_in(jax.random.key(seed), TURN_GAIN_EPISODE), settings.robots)
+    rooms = randomisation.randomise_cameras(rooms, camera_faults, randomisation.TRAINING_PROBABILITY)
     rows, candidates = [], []
     for turn_gain in settings.turn_gains:
         candidates.append(behaviour_cloning.rescale_turns(fit.best, test, turn_gain))
-        record = _walk_with_gain(folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed)
+        record = _walk_with_gain(
+            folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed, faults=camera_faults
+        )
         rows.append({"caution": turn_gain} | _summarise(record))
     least = MIN_RELATIVE_COVERAGE * max(row["coverage"] for row in rows)
     going_on = [k for k, row in enumerate(rows) if row["coverage"] >= least]
@@ -188,6 +199,7 @@ def _run_round(
     seed: int,
     number: int,
     variant: names.Variant,
+    camera_faults: Sequence[FaultName],
 ) -> list[Walk]:
     """Fit the navigator to all walks so far, roll it out for one episode, and return its labelled walks."""
     path = folder / "walks" / f"round-{number}"
@@ -204,7 +216,7 @@ def _run_round(
         recording.record_rollouts(
             path,
             learner,
-            room_batches.training_rooms(seed, FIRST_LEARNER_EPISODE + number, settings.robots),
+            randomisation.training_rooms(seed, FIRST_LEARNER_EPISODE + number, settings.robots, camera_faults),
             settings.round_seconds,
             policies.LEARNED,
             seed=seed,
@@ -212,6 +224,7 @@ def _run_round(
                 "seconds": settings.round_seconds,
                 "round": number,
                 "robot": assembly.fingerprint(learner),
+                **_name_faults(camera_faults),
             },
             label=f"DAgger round {number + 1} of {settings.dagger_rounds}",
         )
@@ -227,6 +240,7 @@ def _walk_with_gain(
     *,
     turn_gain: float,
     seed: int,
+    faults: Sequence[FaultName],
 ) -> closed_loop.Record:
     """Record walks of a navigator whose turns were rescaled."""
     learner = assembly.with_policy(robot, "learned", params)
@@ -241,9 +255,15 @@ def _walk_with_gain(
             "caution": turn_gain,
             "seconds": settings.turn_gain_seconds,
             "robot": assembly.fingerprint(learner),
+            **_name_faults(faults),
         },
         label=f"turn gain {turn_gain:g}",
     )
+
+
+def _name_faults(camera_faults: Sequence[FaultName]) -> JsonObject:
+    """Return what distinguishes walks with faulty cameras from others; nothing for those without."""
+    return {"camera_faults": list(camera_faults)} if camera_faults else {}
 
 
 def _read_round(path: Path, number: int) -> list[Walk]:

@@ -17,7 +17,10 @@ from lgmdjax.pipeline.settings import CollectSettings
 from lgmdjax.runtime.storage import JsonObject, write_json
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, rollout, room_batches
 from lgmdjax.simulation.assembly import load_detector
+from lgmdjax.transfer import randomisation
+from lgmdjax.transfer.names import FaultName
 
+CAMERA_FAULTS = "camera_faults"  # in the header of the episodes, if there are any
 CALIBRATION_EPISODE = 2**20  # an episode number beyond all others: its rooms are used nowhere else
 
 
@@ -32,11 +35,16 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, see
     writer = episodes.Writer(folder / "episodes", _parameters(settings, detector))
     for episode in range(writer.chunks, settings.episodes):
         label = f"collect: episode {episode + 1} of {settings.episodes}"
-        rooms = room_batches.training_rooms(seed, episode, settings.robots)
+        rooms = randomisation.training_rooms(seed, episode, settings.robots, settings.camera_faults)
         chunks = recording.rollout_with_progress(params, model, rooms, settings.seconds, label)
         record = rollout.concatenate_time(list(chunks))
         numbers = episode * settings.robots + np.arange(settings.robots)
         writer.write(record, episode=episode, rooms=numbers.tolist(), seed=seed)
+
+
+def read_camera_faults(header: JsonObject) -> tuple[FaultName, ...]:
+    """Return the faults that the cameras of recorded walks may have."""
+    return tuple(header.get(CAMERA_FAULTS, ()))
 
 
 def _calibrate(gait: Path, settings: CollectSettings, seed: int) -> JsonObject:
@@ -68,4 +76,5 @@ def _parameters(settings: CollectSettings, detector: lgmd.Params) -> JsonObject:
     settings_used = {name: getattr(settings, name) for name in ("robots", "seconds")}
     constants = {name: getattr(detector, name) for name in lgmd.SCALARS}
     teacher = dataclasses.asdict(braitenberg.Params())
-    return settings_used | {"eyes": dataclasses.asdict(settings.eyes), "lgmd": constants, "teacher": teacher}
+    header = settings_used | {"eyes": dataclasses.asdict(settings.eyes), "lgmd": constants, "teacher": teacher}
+    return header | ({CAMERA_FAULTS: list(settings.camera_faults)} if settings.camera_faults else {})

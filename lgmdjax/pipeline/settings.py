@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from lgmdjax.evaluation.settings import TrialPlan
 from lgmdjax.sensors.settings import CameraSettings
+from lgmdjax.transfer.names import FaultName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +32,7 @@ class CollectSettings:
     episodes: int  # number of episodes
     seconds: float  # duration of each robot's walk in an episode [s]
     calibration_seconds: float  # duration of each robot's walk for the calibration of the detectors [s]
+    camera_faults: tuple[FaultName, ...] = ()  # that robots may have, here and in stage train; never in the calibration
 
 
 @dataclass(frozen=True, kw_only=True)

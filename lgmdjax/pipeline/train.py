@@ -22,6 +22,7 @@ from lgmdjax.detectors import lgmd
 from lgmdjax.errors import InputError
 from lgmdjax.learning import behaviour_cloning, dagger, sequences
 from lgmdjax.learning.settings import TrainSettings
+from lgmdjax.pipeline import collect
 from lgmdjax.runtime import schema
 from lgmdjax.runtime.storage import write_arrays, write_json
 from lgmdjax.simulation import assembly, episodes
@@ -42,14 +43,17 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     recorded_with = assembly.read_camera_settings(header)
     robot = assembly.assemble_robot(inputs["fit-gait"], recorded_with, detector, assembly.make_policies())
     robot = assembly.with_resolution(robot, settings.eyes)
-    walks = dagger.run(folder, robot, recorded, settings, seed)
+    faults = collect.read_camera_faults(header)
+    walks = dagger.run(folder, robot, recorded, settings, seed, camera_faults=faults)
     train, test, unseen = dagger.split_rooms(episodes.segments(walks), seed)
     fits = _fit_variants(folder, train, test, settings, seed)
     rooms = {segment.room for segment in train}
     teachers = [segment for segment in episodes.segments(recorded) if segment.room in rooms]
     fits["lstm-halves"] = _fit_halves(folder, teachers, settings, seed)
     sets = {"train": train, "test": test, "unseen": unseen}
-    learned, turn_gains = dagger.select_turn_gain(folder, robot, fits["lstm"], test, settings, seed=seed)
+    learned, turn_gains = dagger.select_turn_gain(
+        folder, robot, fits["lstm"], test, settings, seed=seed, camera_faults=faults
+    )
     result = {
         "curves": {
             name: {"train": fit.train_mse.tolist(), "test": fit.test_mse.tolist()} for name, fit in fits.items()

@@ -24,24 +24,27 @@ def run_dagger(monkeypatch):
 
     The learner's `output_mean` is one plus the number of segments that it was fitted to; `seen` has it per batch.
     """
-    seen, interrupt_at = [], [0]
+    seen, has_faults, interrupt_at = [], [], [0]
 
     def fit(params, train, test, settings, checkpoints):
         fitted = replace(params, output_mean=np.full(2, 1.0 + len(train) + len(test)))
         return behaviour_cloning.FitResult(params=fitted, best=fitted, train_mse=np.zeros(1), test_mse=np.zeros(1))
 
     def rollout(params, model, rooms, seconds, label, *, render):
+        has_faults.append(rooms.faults is not None)
         learner = next(one for one in params.controller.policy.policies if isinstance(one, navigator.Params))
         seen.append(float(learner.output_mean[0]))
         if len(seen) == interrupt_at[0]:
             raise KeyboardInterrupt
         yield walk(len(rooms.starts), frames=150)
 
-    def run(folder, recorded, at_batch=0):
+    def run(folder, recorded, at_batch=0, camera_faults=()):
         seen.clear()
         interrupt_at[0] = at_batch
         robot = assembly.assemble(assembly.make_policies())
-        return dagger.run(folder, robot, recorded, SETTINGS, seed=0), list(seen)
+        has_faults.clear()
+        run.has_faults = has_faults
+        return dagger.run(folder, robot, recorded, SETTINGS, seed=0, camera_faults=camera_faults), list(seen)
 
     monkeypatch.setattr(recording, "BATCH_SIZES", (2,))
     monkeypatch.setattr(recording, "rollout_with_progress", rollout)
@@ -70,6 +73,16 @@ def test_a_round_interrupted_between_batches_resumes_with_the_same_learner(run_d
     walks, seen = run_dagger(tmp_path, recorded)
     assert seen == [9.0, 13.0, 13.0]
     assert len(walks) == 16
+
+
+def test_faults_of_the_cameras_are_in_the_rooms_and_in_the_record(run_dagger, recorded, tmp_path):
+    run_dagger(tmp_path, recorded, camera_faults=("noise", "jpeg"))
+    assert run_dagger.has_faults == [True] * 4
+    header = episodes.read_parameters(tmp_path / "walks" / "round-1")
+    assert header["camera_faults"] == ["noise", "jpeg"]
+    run_dagger(tmp_path / "without", recorded)
+    assert run_dagger.has_faults == [False] * 4
+    assert "camera_faults" not in episodes.read_parameters(tmp_path / "without" / "walks" / "round-1")
 
 
 def test_finished_rounds_are_not_repeated(run_dagger, recorded, tmp_path):
