@@ -25,6 +25,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.minmax import amin
 
 U_AT_REST = 0.5  # response without motion
+MAX_BAND = 120  # columns up to which correlations are products with banded matrices
 
 Scalar = Float[Array, ""] | float
 Cells = Float[Array, "rows columns"]
@@ -70,6 +71,50 @@ def group(summation: Cells, share: Scalar, offset: Scalar) -> Cells:
     Ce = local_mean(summation)
     w = offset - amin(-jnp.abs(Ce).ravel(), 0) / share
     return summation * Ce / w
+
+
+def correlate(
+    layers: Float[Array, "layers rows columns"],
+    weights: Float[Array, "layers K K"],
+    before: int,
+    after: int,
+    stride: int = 1,
+) -> Float[Array, "layers out_rows out_columns"]:
+    """Return each layer correlated with its weights; cells beyond the border are zero.
+
+    Small layers are multiplied with banded matrices, one for each row of the weights: on a CPU that takes a half to a
+    quarter of the time of `lax.conv`, and its derivative a fifth. A band wastes products in proportion to the width.
+
+    >>> ramp = jnp.arange(5.0)[None, None]
+    >>> correlate(ramp, jnp.asarray([[[0.0, 1.0, 2.0]] * 3]), 1, 1)[0, 0].tolist()
+    [2.0, 5.0, 8.0, 11.0, 4.0]
+
+    Args:
+        layers: of cells.
+        weights: of the cells around each, the same number in rows and columns.
+        before: cells of zeros added above and to the left.
+        after: the same below and to the right.
+        stride: cells from one output to the next.
+    """
+    count, rows, columns = layers.shape
+    side = weights.shape[-1]
+    if columns > MAX_BAND:
+        padding = ((before, after), (before, after))
+        return lax.conv_general_dilated(
+            layers[None],
+            weights[:, None],
+            (stride, stride),
+            padding,
+            feature_group_count=count,
+            precision=lax.Precision.HIGHEST,
+        )[0]
+    out_rows, out_columns = ((size + before + after - side) // stride + 1 for size in (rows, columns))
+    padded = jnp.pad(layers, ((0, 0), (before, after), (0, 0)))
+    last = (out_rows - 1) * stride + 1
+    shifted = jnp.stack([padded[:, row : row + last : stride] for row in range(side)], axis=1)
+    offset = np.arange(columns)[:, None] - stride * np.arange(out_columns) + before
+    band = jnp.where((offset >= 0) & (offset < side), weights[..., np.clip(offset, 0, side - 1)], 0.0)
+    return jnp.einsum("lkrc,lkcx->lrx", shifted, band.astype(layers.dtype), precision=lax.Precision.HIGHEST)
 
 
 def gate(margin: Array, width: Scalar | None) -> Array:

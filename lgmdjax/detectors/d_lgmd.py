@@ -66,10 +66,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import lax
 from jaxtyping import Array, Float
 
-from lgmdjax.detectors.cells import Cells, Scalar, gate, mean, pool, rectify, require_frame, require_size
+from lgmdjax.detectors.cells import Cells, Scalar, correlate, gate, mean, pool, rectify, require_frame, require_size
 from lgmdjax.minmax import maximum, minimum
 
 RADIUS = 6  # cells, half the width of the kernels
@@ -169,9 +168,9 @@ def layers(params: Params, state: State, frame: Float[Array, "height width"]) ->
     W = kernels(params)
     changes = jnp.concatenate([P[None], state.changes])
     weights = jnp.stack([W.now, -W.one_later, -W.two_later]).astype(P.dtype)
-    S = rectify(_correlate(changes, weights, RADIUS, RADIUS))
+    S = rectify(jnp.sum(correlate(changes, weights, RADIUS, RADIUS), axis=0))
     # As MATLAB's conv2(..., "same"): one cell up and left, two cells down and right.
-    Ce = _correlate(S[None], jnp.full((1, GROUP, GROUP), GROUP**-2, P.dtype), GROUP // 2 - 1, GROUP // 2)
+    Ce = correlate(S[None], jnp.full((1, GROUP, GROUP), GROUP**-2, P.dtype), GROUP // 2 - 1, GROUP // 2)[0]
     T_G = minimum(params.threshold * mean(state.changes[1]), params.max_threshold)
     G = S * Ce
     G = minimum(G, 1.0) * gate(G - T_G, params.threshold_width if params.smooth else None)
@@ -198,12 +197,3 @@ def _shares(tau: Kernel, interpolated: bool) -> Float[Array, "3 side side"]:
     if interpolated:
         return jnp.stack([rectify(1.0 - jnp.abs(minimum(maximum(tau, 0.0), 2.0) - frames)) for frames in range(3)])
     return jnp.stack([tau < 1.0, (tau >= 1.0) & (tau < 2.0), tau >= 2.0]).astype(tau.dtype)
-
-
-def _correlate(
-    layers: Float[Array, "layers rows columns"], weights: Float[Array, "layers h w"], before: int, after: int
-) -> Cells:
-    """Return the sum over layers of each correlated with its weights; cells beyond the border are zero."""
-    padding = ((before, after), (before, after))
-    out = lax.conv_general_dilated(layers[None], weights[None], (1, 1), padding, precision=lax.Precision.HIGHEST)
-    return out[0, 0]

@@ -40,11 +40,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import lax
 from jaxtyping import Array, Float
 
 from lgmdjax.detectors import emd
-from lgmdjax.detectors.cells import Scalar, rectify
+from lgmdjax.detectors.cells import Scalar, correlate, rectify
 from lgmdjax.errors import InputError
 
 State = emd.State
@@ -131,8 +130,10 @@ def directions(field: emd.Motion) -> Float[Array, "4 rows columns"]:
 
 
 def _units(params: Params, M: Float[Array, "4 rows columns"]) -> Float[Array, "unit_rows unit_columns"]:
-    excited = _correlate(M, _turned(params.excitation_weights, M), params.stride)
-    inhibited = _correlate(M, _turned(params.inhibition_weights, M), params.stride)
+    excited, inhibited = (
+        correlate(M, _turned(weights, M), weights.shape[0] // 2, weights.shape[0] // 2, params.stride)
+        for weights in (params.excitation_weights, params.inhibition_weights)
+    )
     inhibition = jnp.sum(rectify(inhibited + params.inhibition_intercept), axis=0)
     return rectify(jnp.sum(excited, axis=0) - inhibition + params.intercept)
 
@@ -140,16 +141,3 @@ def _units(params: Params, M: Float[Array, "4 rows columns"]) -> Float[Array, "u
 def _turned(weights: Weights, like: Array) -> Float[Array, "4 K K"]:
     """Return the weights for each direction; turning counter-clockwise leads from right to up, left, down."""
     return jnp.stack([jnp.rot90(weights, turns) for turns in range(4)]).astype(like.dtype)
-
-
-def _correlate(M: Float[Array, "4 rows columns"], weights: Float[Array, "4 K K"], stride: int) -> Array:
-    """Return each direction correlated with its weights around every unit; beyond the border nothing moves."""
-    reach = weights.shape[1] // 2
-    return lax.conv_general_dilated(
-        M[None],
-        weights[:, None],
-        (stride, stride),
-        ((reach, reach), (reach, reach)),
-        feature_group_count=4,
-        precision=lax.Precision.HIGHEST,
-    )[0]
