@@ -6,7 +6,7 @@
 | --------- | ------------------------------------------------------------------------------------------- |
 | calls     | one call for each frame, as on a robot                                                      |
 | scan      | all frames in one program (`lax.scan`, as in a rollout), with the slicing of the frames     |
-| OpenCV    | subtract, filter2D, absdiff, scaleAdd and threshold, as one would write without JAX         |
+| OpenCV    | subtract, filter2D, absdiff, scaleAdd and threshold (`benchmarks/detectors_by_hand.py`)     |
 
 All see the same frames, in turns within one run. Timed is the processor time of the process, which on one core equals
 the wall time of an idle machine; so neither times nor ratios depend on other programs.
@@ -23,6 +23,7 @@ if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 import cv2
+import detectors_by_hand
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +34,6 @@ SIZES = ((80, 60), (160, 120), (320, 240), (640, 480))
 FRAMES = 16
 ROUNDS = 40
 PARAMS = lgmd.Params()
-KERNEL = np.array(lgmd.KERNEL, np.float32)
 
 
 def make_frames(width: int, height: int) -> np.ndarray:
@@ -48,23 +48,10 @@ def make_frames(width: int, height: int) -> np.ndarray:
     return np.stack([[s[:, 8 : 8 + width], s[:, 20 : 20 + width]] for s in shifted]).astype(np.float32)
 
 
-def run_opencv(frames: np.ndarray) -> list[tuple[float, float]]:
+def run_opencv(frames: np.ndarray) -> list[list[float]]:
     """Run eqs. 7-16 with OpenCV; return u of both eyes for each frame."""
-    last, previous = list(frames[0]), [np.zeros_like(frames[0, 0])] * 2
-    responses = []
-    for frame in frames[1:]:
-        u = [0.0, 0.0]
-        for eye in (0, 1):
-            L, P_before = np.ascontiguousarray(frame[eye]), previous[eye]
-            P, E = cv2.subtract(L, last[eye]), cv2.absdiff(L, last[eye])
-            I = np.abs(cv2.filter2D(P_before, cv2.CV_32F, KERNEL, borderType=cv2.BORDER_CONSTANT))  # noqa: E741
-            S = cv2.scaleAdd(I, -0.4, E)
-            _, passed = cv2.threshold(S, float(PARAMS.threshold), 0, cv2.THRESH_TOZERO)
-            U, FF = cv2.sumElems(passed)[0] / L.size, cv2.norm(P_before, cv2.NORM_L1) / L.size
-            u[eye] = 0.5 if float(PARAMS.suppression) < FF else 1 / (1 + np.exp(-U))
-            last[eye], previous[eye] = L, P
-        responses.append((u[0], u[1]))
-    return responses
+    eyes = [detectors_by_hand.LGMD(PARAMS, first) for first in frames[0]]
+    return [[see(L)[0] for see, L in zip(eyes, frame, strict=True)] for frame in frames[1:]]
 
 
 step_both_eyes = jax.vmap(partial(lgmd.step, PARAMS))
@@ -89,12 +76,12 @@ def run_calls(state: lgmd.State, frames: list[jax.Array]) -> list[jax.Array]:
     return responses
 
 
-def medians(candidates: Mapping[str, Callable[[], object]]) -> dict[str, float]:
-    """Time candidates in turns; return the median time of a stereo frame [ms]."""
+def medians(candidates: Mapping[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
+    """Time candidates, which run over all frames, in turns; return the median time of a frame [ms]."""
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for run in candidates.values():
         run()
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for name, run in candidates.items():
             start = time.process_time()
             run()
