@@ -10,7 +10,8 @@
 
 All see the same frames of one eye, in turns within one run: a drifting texture, and a dark square that expands. Before
 they are timed, their u and excitation are compared. As in `benchmarks/lgmd.py`, timed is the processor time of the
-process, and constants are those of `Params()`, known when a program is compiled.
+process, and constants are those of `Params()`, known when a program is compiled. Measure on an idle machine: JAX may
+leave a call to a thread of its own and wait, and other programs that run meanwhile empty the caches.
 """
 
 import argparse

@@ -1,9 +1,10 @@
 """The looming detectors in OpenCV and NumPy, as one would write them without JAX: vectorised, float32, of one thread.
 
 Each is made from its `Params` and a first frame; a call with the next frame returns u and the excitation. The equations
-and their symbols are those of `lgmdjax/detectors`, for any constants, but without the options (pooling, smooth and the
-like). What a weight of zero makes vanish is left out. Weighted sums over neighbours are linear, so weights and delays
-are folded into the kernels. Layers that are no longer needed are overwritten.
+and their symbols are those of `lgmdjax/detectors`. Constants are free but for D-LGMD's, which must leave its kernels
+separable; options (pooling, smooth and the like) have their defaults. What a weight of zero makes vanish is left out.
+Weighted sums over neighbours are linear, so weights and delays are folded into the kernels. Layers that are no longer
+needed are overwritten.
 """
 
 import math
