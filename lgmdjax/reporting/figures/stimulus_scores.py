@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from lgmdjax.reporting.figures import style
 from lgmdjax.runtime.storage import JsonObject
@@ -54,6 +55,7 @@ def plot(rows: Sequence[JsonObject]) -> Figure:
     timing.set_xscale("log")
     timing.set_yscale("symlog", linthresh=0.03, linscale=0.5)
     timing.xaxis.set_major_formatter("{x:g}")
+    timing.xaxis.set_minor_formatter(NullFormatter())
     timing.yaxis.set_major_formatter("{x:g}")
     timing.set(xlabel="l/|v| [s]", ylabel="peak before contact [s]", title="Timing")
     contrast.set(xlabel="contrast", ylabel="peak of u - 0.5", ylim=(-0.02, 0.52), title="Contrast")

@@ -21,6 +21,7 @@ palette of Okabe & Ito, which colour-blind readers can tell apart.
 | `stimulus_scores.plot`                        | -            | looming detectors on laboratory stimuli              |
 | `sweeps.plot`                                 | -            | measures of a sweep against its settings             |
 | `clip_scores.plot_roc`, `plot_clip`           | -            | looming detectors on video clips                     |
+| `detector_fits.plot`                          | -            | looming detectors before and after a fit by gradient |
 | `detector_walks.plot`                         | -            | looming detectors as the eyes of one robot           |
 """
 
