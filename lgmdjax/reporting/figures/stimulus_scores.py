@@ -57,7 +57,7 @@ def plot(rows: Sequence[JsonObject]) -> Figure:
     timing.xaxis.set_major_formatter("{x:g}")
     timing.xaxis.set_minor_formatter(NullFormatter())
     timing.yaxis.set_major_formatter("{x:g}")
-    timing.set(xlabel="l/|v| [s]", ylabel="peak before contact [s]", title="Timing")
+    timing.set(xlabel="l/|v| [s]", ylabel="peak before contact [s]", ylim=(0, None), title="Timing")
     contrast.set(xlabel="contrast", ylabel="peak of u - 0.5", ylim=(-0.02, 0.52), title="Contrast")
     noise.set(xlabel="noise [grey]", ylabel="peak: approach minus still", title="Noise")
     lower.legend(*noise.get_legend_handles_labels(), loc="outside lower center", ncols=5)
