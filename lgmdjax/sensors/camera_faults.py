@@ -2,7 +2,8 @@
 
 A picture passes, in this order, vignetting, motion blur, automatic exposure, noise, the sensor's gamma, rounding to 8
 bits, and JPEG; then it may be dropped, and it arrives late. Without a fault, `step` returns the picture unchanged, but
-rounded. All numbers are arrays, so that `vmap` gives each robot of a batch its own camera.
+rounded. A picture smaller than the sensor's is the average of the sensor's pixels: it has less noise and is rounded to
+1/sqrt(n) grey levels, the error that remains of theirs. JPEG's blocks are those of the picture. All numbers are arrays, so that `vmap` gives each robot of a batch its own camera.
 
 | symbol | name                                            | unit      | where                                        |
 | ------ | ----------------------------------------------- | --------- | -------------------------------------------- |
@@ -12,7 +13,8 @@ rounded. All numbers are arrays, so that `vmap` gives each robot of a batch its 
 | s      | open part of the frame interval                 | 1         | L - s/2 (L - previous L): linear in time     |
 | g      | logarithm of the gain of the exposure           | 1         | g += w (a - log(mean L / M) - g)             |
 | a      | target of g, which drifts (Ornstein-Uhlenbeck)  | 1         |                                              |
-| e, r   | electrons per grey level, read noise            | 1/grey, 1 | variance L/e + (r/e)^2                       |
+| n      | sensor pixels that a pixel of the picture averages | 1      | (`SENSOR_WIDTH` / width)^2                   |
+| e, r   | electrons per grey level, read noise            | 1/grey, 1 | variance (L/e + (r/e)^2) / n                 |
 | gamma  | gamma of the sensor                             | 1         | 255 (L/255)^gamma                            |
 | q      | quality of JPEG                                 | 1..100    | steps of ITU-T T.81, scaled as libjpeg does  |
 
@@ -20,6 +22,7 @@ Errors of lens and pose are not operations on a picture, because the picture lac
 `LensError` is for code that casts the rays; `warp` approximates the distortion on a picture.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -32,6 +35,7 @@ from lgmdjax.minmax import clip
 
 MAX_LATENCY = 3  # frames
 BLOCK = 8  # px, of JPEG
+SENSOR_WIDTH = 320  # px, of the robot's camera (paper sec. 3.1)
 MEAN_GREY = 118.0  # M, to which automatic exposure brings a picture
 EXPOSURE_RATE, DRIFT_TIME = 0.05, 150.0  # w, per frame; time constant of the exposure's drift, frames
 LUMINANCE = np.array(
@@ -69,6 +73,7 @@ class Params:
     noise: Float[Array, ""] | float = 0.0  # 1: there is noise
     electrons: Float[Array, ""] | float = 20.0  # e; a full well of 5,100 electrons
     read: Float[Array, ""] | float = 10.0  # r, electrons
+    averaged: Float[Array, ""] | float = 1.0  # n
     gamma: Float[Array, ""] | float = 1.0
     quality: Float[Array, ""] | float = 0.0  # q; 0: no JPEG
     dropped: Float[Array, ""] | float = 0.0  # probability that a picture is lost
@@ -92,6 +97,15 @@ class Delivery(NamedTuple):
 
     pictures: Float[Array, "2 height width"]
     arrived: Bool[Array, ""]  # whether there is a new picture
+
+
+def average(params: Params, width: int) -> Params:
+    """Return the faults of a sensor of `SENSOR_WIDTH` columns for pictures of `width` columns; sets n, at least 1.
+
+    >>> average(Params(), 80).averaged
+    16.0
+    """
+    return replace(params, averaged=max(SENSOR_WIDTH / width, 1.0) ** 2)
 
 
 def init(params: Params, pictures: Float[Array, "2 height width"], key: Array) -> State:
@@ -122,7 +136,8 @@ def step(params: Params, state: State, pictures: Float[Array, "2 height width"])
     exposure_target, gain = adapt(params, state, light, drift_key)
     light = jnp.exp(params.auto_exposure * gain) * light
     light = light + params.noise * _noise(params, light, noise_key)
-    grey = _round(clip(apply_gamma(light, params.gamma), 0.0, 255.0))
+    levels = jnp.sqrt(jnp.asarray(params.averaged, light.dtype))  # per grey level
+    grey = _round(levels * clip(apply_gamma(light, params.gamma), 0.0, 255.0)) / levels
     grey = jnp.where(jnp.asarray(params.quality) > 0, compress(grey, jnp.maximum(params.quality, 1.0)), grey)
     kept = ~jax.random.bernoulli(drop_key, params.dropped)
     waiting = jnp.concatenate([grey[None], state.waiting[:-1]])
@@ -153,7 +168,7 @@ def adapt(params: Params, state: State, light: Array, key: Array) -> tuple[Array
 
 def _noise(params: Params, light: Array, key: Array) -> Array:
     """Return photon and read noise in grey levels; above twenty electrons Poisson's is nearly normal."""
-    variance = jnp.maximum(light, 0.0) / params.electrons + (params.read / params.electrons) ** 2
+    variance = (jnp.maximum(light, 0.0) / params.electrons + (params.read / params.electrons) ** 2) / params.averaged
     return jnp.sqrt(variance) * jax.random.normal(key, light.shape, light.dtype)
 
 

@@ -226,7 +226,8 @@ def observe(
     frames, ranges = sense(params, scene, state, render)
     if faults is None or state.cameras is None:
         return respond(params, state, frames, ranges)
-    cameras, frames = faulty_cameras.step(faults, state.cameras, frames, state.is_first)
+    sensor = camera_faults.average(faults, params.camera.width)
+    cameras, frames = faulty_cameras.step(sensor, state.cameras, frames, state.is_first)
     response = _where(cameras.is_waiting, controller.rest(frames.dtype), state.response)
     return respond(params, replace(state, cameras=cameras, response=response), frames, ranges)
 

@@ -71,7 +71,8 @@ def process_picture(
 ) -> State:
     """Return the state after taking a picture and a scan; if a picture arrives, detectors and policy process it."""
     cameras = replace(state.cameras, previous=_previous(state, pictures))
-    cameras, delivery = camera_faults.step(faults.camera, cameras, pictures)
+    sensor = camera_faults.average(faults.camera, params.camera.width)
+    cameras, delivery = camera_faults.step(sensor, cameras, pictures)
     field = {"overlap": params.camera.overlap, "ground": params.camera.ground}
     frames = [hemifield.crop(delivery.pictures[side], side, **field) for side in (hemifield.LEFT, hemifield.RIGHT)]
     seen, response = controller.detect_or_start(params.controller, state.controller, jnp.stack(frames), state.is_first)

@@ -52,6 +52,16 @@ def test_photon_noise_has_the_variance_of_its_electrons():
     assert (delivered != run(Params(noise=1.0), flat, seed=1)[0]).any()
 
 
+def test_a_small_picture_has_the_noise_of_the_sensors_picture_averaged():
+    flat, faults = np.full((40, 2, HEIGHT, WIDTH), 100.3), Params(noise=1.0)
+    sensor, _ = run(faults, flat.repeat(4, axis=2).repeat(4, axis=3))
+    averaged = sensor.reshape(40, 2, HEIGHT, 4, WIDTH, 4).mean(axis=(3, 5))
+    small, _ = run(camera_faults.average(faults, camera_faults.SENSOR_WIDTH // 4), flat)
+    assert small.mean() == pytest.approx(averaged.mean(), abs=0.02)
+    assert small.std() == pytest.approx(averaged.std(), rel=0.03)
+    assert camera_faults.average(faults, 2 * camera_faults.SENSOR_WIDTH).averaged == 1
+
+
 def test_gamma_and_vignetting():
     flat = np.full((1, 2, HEIGHT, WIDTH), 64.0)
     assert run(Params(gamma=2.0), flat)[0].flat[0] == round(255 * (64 / 255) ** 2)
