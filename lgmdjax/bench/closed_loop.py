@@ -20,14 +20,14 @@ are in the way at once, and the nearest one changes from frame to frame. The upp
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from lgmdjax.bench import cost, teacher_walks, worlds
+from lgmdjax.bench import cost, stages, teacher_walks, worlds
 from lgmdjax.bench.settings import CAMERA_FAULTS, ClosedLoopSettings
+from lgmdjax.bench.stages import OWN, SCORES, WALKS, StageSettings
 from lgmdjax.control import navigator, policies
-from lgmdjax.detectors import protocol
 from lgmdjax.evaluation import metrics, stimulus_scores
 from lgmdjax.learning import behaviour_cloning, dagger, detector_calibration, detector_responses
 from lgmdjax.runtime import storage
@@ -35,39 +35,26 @@ from lgmdjax.runtime.run_folders import Stage
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, rerender, room_batches
 
-OWN = "robot"  # the robot's own LGMD
-WALKS, REFERENCES, SCORES = "walks", "references", "scores"
-
-
-@dataclass(frozen=True, kw_only=True)
-class StageSettings:
-    """What the files of a stage depend on."""
-
-    robot: str  # its fingerprint
-    size: ClosedLoopSettings
-    detector: str = ""  # its name
-    source: str = ""  # what distinguishes it from others (`protocol.identify`)
+REFERENCES = "references"
 
 
 def plan(
     robot: closed_loop.Params, names: Sequence[str], size: ClosedLoopSettings
-) -> tuple[list[Stage], dict[str, StageSettings]]:
+) -> tuple[list[Stage], dict[str, StageSettings[ClosedLoopSettings]]]:
     """Return the stages of a comparison, in order, and their settings by name."""
     robot = assembly.with_resolution(robot, size.benchmark.eyes)
-    base = StageSettings(robot=assembly.fingerprint(robot), size=size)
-    stages, settings = [Stage(name=WALKS, run=partial(record_walks, robot))], {WALKS: base}
-    for name in names:
-        source = name if name == OWN else protocol.identify(stimulus_scores.get_detector(name).detector)
-        stages.append(Stage(name=teacher_walks.stage_name(name), run=partial(train_and_score, robot), inputs=(WALKS,)))
-        settings[stages[-1].name] = replace(base, detector=name, source=source)
-    stages.append(Stage(name=REFERENCES, run=partial(score_references, robot)))
-    inputs = tuple(stage.name for stage in stages[1:])
-    stages.append(Stage(name=SCORES, run=gather, inputs=inputs))
-    return stages, settings | {REFERENCES: base, SCORES: base}
+    made, settings = stages.plan(robot, names, size, record_walks, train_and_score)
+    made.append(Stage(name=REFERENCES, run=partial(score_references, robot)))
+    made.append(Stage(name=SCORES, run=gather, inputs=tuple(stage.name for stage in made[1:])))
+    return made, settings | {REFERENCES: settings[WALKS], SCORES: settings[WALKS]}
 
 
 def record_walks(
-    robot: closed_loop.Params, folder: Path, _: Mapping[str, Path], settings: StageSettings, seed: int
+    robot: closed_loop.Params,
+    folder: Path,
+    _: Mapping[str, Path],
+    settings: StageSettings[ClosedLoopSettings],
+    seed: int,
 ) -> None:
     """Record the teacher's walks, without pictures: of the calibration, and the demonstrations of each seed."""
     size = settings.size
@@ -77,7 +64,11 @@ def record_walks(
 
 
 def train_and_score(
-    robot: closed_loop.Params, folder: Path, inputs: Mapping[str, Path], settings: StageSettings, seed: int
+    robot: closed_loop.Params,
+    folder: Path,
+    inputs: Mapping[str, Path],
+    settings: StageSettings[ClosedLoopSettings],
+    seed: int,
 ) -> None:
     """Write calibration.json and scores.json of one detector, its navigators, and their walks."""
     size, name = settings.size, settings.detector
@@ -102,7 +93,7 @@ def train_and_score(
 
 
 def _calibrate(
-    robot: closed_loop.Params, walks: Path, settings: StageSettings, seed: int
+    robot: closed_loop.Params, walks: Path, settings: StageSettings[ClosedLoopSettings], seed: int
 ) -> tuple[closed_loop.Params, list[JsonObject]]:
     """Return the robot with the calibrated detector, and the candidates; the robot's own LGMD stays as it is."""
     if settings.detector == OWN:
@@ -130,7 +121,11 @@ def train(
 
 
 def score_references(
-    robot: closed_loop.Params, folder: Path, _: Mapping[str, Path], settings: StageSettings, seed: int
+    robot: closed_loop.Params,
+    folder: Path,
+    _: Mapping[str, Path],
+    settings: StageSettings[ClosedLoopSettings],
+    seed: int,
 ) -> None:
     """Write scores.json of the robots that need no detector, in the worlds without camera faults."""
     rows = []
@@ -177,7 +172,7 @@ def summarise(world: str, records: Sequence[closed_loop.Record], size: ClosedLoo
     return asdict(metrics.score(worlds.concatenate(records))) | {"each_per_100_m": each}
 
 
-def gather(folder: Path, inputs: Mapping[str, Path], settings: StageSettings, seed: int) -> None:
+def gather(folder: Path, inputs: Mapping[str, Path], settings: StageSettings[ClosedLoopSettings], seed: int) -> None:
     """Write scores.json: the rows of all detectors, and of the references."""
     rows = []
     for stage, place in inputs.items():

@@ -16,16 +16,17 @@ fit (`lgmdjax.learning.detector_fit`) starts where the search ended.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
-from lgmdjax.bench import teacher_walks
+from lgmdjax.bench import stages, teacher_walks
 from lgmdjax.bench.settings import FitSettings
-from lgmdjax.detectors import protocol, scaled
+from lgmdjax.bench.stages import SCORES, WALKS, StageSettings
+from lgmdjax.detectors import scaled
 from lgmdjax.evaluation import metrics, stimulus_clips, stimulus_scores
 from lgmdjax.evaluation.stimulus_scores import DetectorSetup
 from lgmdjax.learning import detector_calibration, detector_fit
@@ -36,46 +37,29 @@ from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import camera
 from lgmdjax.simulation import assembly, closed_loop
 
-WALKS, SCORES = "walks", "scores"
 STEPS = ("published", "searched", "fitted")
 CONTRASTS = tuple(2.0**power for power in range(-6, 7))  # of the search on stimuli
 
 
-@dataclass(frozen=True, kw_only=True)
-class StageSettings:
-    """What the files of a stage depend on."""
-
-    robot: str  # its fingerprint
-    size: FitSettings
-    detector: str = ""  # its name
-    source: str = ""  # what distinguishes it from others (`protocol.identify`)
-
-
 def plan(
     robot: closed_loop.Params, names: Sequence[str], size: FitSettings
-) -> tuple[list[Stage], dict[str, StageSettings]]:
+) -> tuple[list[Stage], dict[str, StageSettings[FitSettings]]]:
     """Return the stages of the fits, in order, and their settings by name."""
     robot = assembly.with_resolution(robot, size.eyes)
-    base = StageSettings(robot=assembly.fingerprint(robot), size=size)
-    stages, settings = [Stage(name=WALKS, run=partial(record_walks, robot))], {WALKS: base}
-    for name in names:
-        stage = Stage(name=teacher_walks.stage_name(name), run=partial(fit_detector, robot), inputs=(WALKS,))
-        source = protocol.identify(stimulus_scores.get_detector(name).detector)
-        stages.append(stage)
-        settings[stage.name] = replace(base, detector=name, source=source)
-    stages.append(Stage(name=SCORES, run=gather, inputs=tuple(stage.name for stage in stages[1:])))
-    return stages, settings | {SCORES: base}
+    made, settings = stages.plan(robot, names, size, record_walks, fit_detector)
+    made.append(Stage(name=SCORES, run=gather, inputs=tuple(stage.name for stage in made[1:])))
+    return made, settings | {SCORES: settings[WALKS]}
 
 
 def record_walks(
-    robot: closed_loop.Params, folder: Path, _: Mapping[str, Path], settings: StageSettings, seed: int
+    robot: closed_loop.Params, folder: Path, _: Mapping[str, Path], settings: StageSettings[FitSettings], seed: int
 ) -> None:
     """Record walks of the teacher that turns away from everything near."""
     teacher_walks.record_turning(folder, robot, settings.size.walks, seed)
 
 
 def fit_detector(
-    robot: closed_loop.Params, folder: Path, inputs: Mapping[str, Path], settings: StageSettings, seed: int
+    robot: closed_loop.Params, folder: Path, inputs: Mapping[str, Path], settings: StageSettings[FitSettings], seed: int
 ) -> None:
     """Write scores.json of one detector: scores and constants at each of `STEPS`, and the curves of the fits."""
     size, name = settings.size, settings.detector
@@ -158,6 +142,6 @@ def _summarise(
     return {"scores": dict(zip(STEPS, scores, strict=True)), "constants": constants, "curve": curve}
 
 
-def gather(folder: Path, inputs: Mapping[str, Path], settings: StageSettings, seed: int) -> None:
+def gather(folder: Path, inputs: Mapping[str, Path], settings: StageSettings[FitSettings], seed: int) -> None:
     """Write scores.json: the rows of all detectors."""
     storage.write_json(folder / "scores.json", [storage.read_json(place / "scores.json") for place in inputs.values()])

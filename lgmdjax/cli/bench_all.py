@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from lgmdjax.bench import closed_loop, summary, tables
+from lgmdjax.bench import stages, summary, tables
 from lgmdjax.bench.tables import Table
 from lgmdjax.cli import bench_clips, bench_closed_loop, bench_fit, bench_stimuli
 from lgmdjax.cli.flags import BenchFlags
@@ -78,13 +78,13 @@ def choose(flags: BenchFlags) -> dict[str, BenchFlags]:
     """
     if flags.paths:
         bench_clips.read_arguments(flags.paths)
-    given = [name for name in flags.detector if name != closed_loop.OWN]
+    given = [name for name in flags.detector if name != stages.OWN]
     seeing = [name for name in given if name == "all" or not stimulus_scores.get_detector(name).is_ideal]
     detectors = {
         "stimuli": given,
         "clips": seeing if flags.paths else [],
         "fit": seeing,
-        "closed-loop": [name for name in flags.detector if name in (closed_loop.OWN, *seeing)],
+        "closed-loop": [name for name in flags.detector if name in (stages.OWN, *seeing)],
     }
     return {
         name: replace(flags, on=name, detector=tuple(some), paths=flags.paths if name == "clips" else ())

@@ -11,7 +11,7 @@ Writes a run folder, closed-loop-<scale>, with a folder for each stage (`lgmdjax
 
 from collections.abc import Iterator
 
-from lgmdjax.bench import closed_loop, tables, worlds
+from lgmdjax.bench import closed_loop, stages, tables, worlds
 from lgmdjax.bench.settings import CAMERA_FAULTS, CLOSED_LOOP_SCALES
 from lgmdjax.cli.flags import BenchFlags
 from lgmdjax.errors import InputError
@@ -26,11 +26,11 @@ CAPTION = "Looming detectors that steer the same robot, with navigators trained 
 
 def run_closed_loop(flags: BenchFlags) -> Iterator[str]:
     """Run the comparison, or resume it; yield a line about each detector, then the names of the files."""
-    names, size = stimulus_scores.choose_seeing(flags.detector, [closed_loop.OWN]), CLOSED_LOOP_SCALES[flags.scale]
-    stages, settings = closed_loop.plan(load_robot(flags), names, size)
+    names, size = stimulus_scores.choose_seeing(flags.detector, [stages.OWN]), CLOSED_LOOP_SCALES[flags.scale]
+    planned, settings = closed_loop.plan(load_robot(flags), names, size)
     name, remedy = f"closed-loop-{flags.scale}", "choose another --out"
     run = run_folders.open_run(flags.out, name, flags.scale, flags.seed, settings, remedy=remedy)
-    rows = storage.read_json(run_folders.execute(run, stages, closed_loop.SCORES) / "scores.json")
+    rows = storage.read_json(run_folders.execute(run, planned, stages.SCORES) / "scores.json")
     for row in rows:
         rooms = row[worlds.ROOMS]
         yield (

@@ -11,7 +11,7 @@ Writes a run folder, fit-<scale>, with a folder for each stage (`lgmdjax.bench.f
 
 from collections.abc import Iterator
 
-from lgmdjax.bench import fitting, tables
+from lgmdjax.bench import fitting, stages, tables
 from lgmdjax.bench.settings import FIT_SCALES
 from lgmdjax.cli import bench_closed_loop
 from lgmdjax.cli.flags import BenchFlags
@@ -25,10 +25,10 @@ CAPTION = "Scores of looming detectors with published constants, after a search,
 def run_fit(flags: BenchFlags) -> Iterator[str]:
     """Run the fits, or resume them; yield a line about each detector, then the names of the files."""
     names, size = stimulus_scores.choose_seeing(flags.detector), FIT_SCALES[flags.scale]
-    stages, settings = fitting.plan(bench_closed_loop.load_robot(flags), names, size)
+    planned, settings = fitting.plan(bench_closed_loop.load_robot(flags), names, size)
     name, remedy = f"fit-{flags.scale}", "choose another --out"
     run = run_folders.open_run(flags.out, name, flags.scale, flags.seed, settings, remedy=remedy)
-    rows = storage.read_json(run_folders.execute(run, stages, fitting.SCORES) / "scores.json")
+    rows = storage.read_json(run_folders.execute(run, planned, stages.SCORES) / "scores.json")
     for row in rows:
         yield f"{row['detector']}: r on walks {_change(row['walks'])}; area under ROC {_change(row['stimuli'])}"
     results = tables.Results(rows, tables.fits(rows), detector_fits.plot(rows), CAPTION, size)

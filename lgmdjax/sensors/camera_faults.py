@@ -2,21 +2,22 @@
 
 A picture passes, in this order, vignetting, motion blur, automatic exposure, noise, the sensor's gamma, rounding to 8
 bits, and JPEG; then it may be dropped, and it arrives late. Without a fault, `step` returns the picture unchanged, but
-rounded. A picture smaller than the sensor's is the average of the sensor's pixels: it has less noise and is rounded to
-1/sqrt(n) grey levels, the error that remains of theirs. JPEG's blocks are those of the picture. All numbers are arrays, so that `vmap` gives each robot of a batch its own camera.
+rounded. A picture smaller than the sensor's is the average of the sensor's pixels: it has less noise, and is rounded to
+1/sqrt(n) grey levels, the error that remains of theirs. JPEG's blocks are those of the picture. All numbers are arrays,
+so that `vmap` gives each robot of a batch its own camera.
 
-| symbol | name                                            | unit      | where                                        |
-| ------ | ----------------------------------------------- | --------- | -------------------------------------------- |
-| L      | picture                                         | grey      | 0..255                                       |
-| rho    | distance of a pixel from the middle             | 1         | 1 at the left and right edge                 |
-| c      | loss of light                                   | 1         | L (1 - c min(rho, 1)^2)                      |
-| s      | open part of the frame interval                 | 1         | L - s/2 (L - previous L): linear in time     |
-| g      | logarithm of the gain of the exposure           | 1         | g += w (a - log(mean L / M) - g)             |
-| a      | target of g, which drifts (Ornstein-Uhlenbeck)  | 1         |                                              |
-| n      | sensor pixels that a pixel of the picture averages | 1      | (`SENSOR_WIDTH` / width)^2                   |
-| e, r   | electrons per grey level, read noise            | 1/grey, 1 | variance (L/e + (r/e)^2) / n                 |
-| gamma  | gamma of the sensor                             | 1         | 255 (L/255)^gamma                            |
-| q      | quality of JPEG                                 | 1..100    | steps of ITU-T T.81, scaled as libjpeg does  |
+| symbol | name                                           | unit      | where                                       |
+| ------ | ---------------------------------------------- | --------- | ------------------------------------------- |
+| L      | picture                                        | grey      | 0..255                                      |
+| rho    | distance of a pixel from the middle            | 1         | 1 at the left and right edge                |
+| c      | loss of light                                  | 1         | L (1 - c min(rho, 1)^2)                     |
+| s      | open part of the frame interval                | 1         | L - s/2 (L - previous L): linear in time    |
+| g      | logarithm of the gain of the exposure          | 1         | g += w (a - log(mean L / M) - g)            |
+| a      | target of g, which drifts (Ornstein-Uhlenbeck) | 1         |                                             |
+| n      | sensor pixels averaged in one of the picture   | 1         | (`SENSOR_WIDTH` / width)^2                  |
+| e, r   | electrons per grey level, read noise           | 1/grey, 1 | variance (L/e + (r/e)^2) / n                |
+| gamma  | gamma of the sensor                            | 1         | 255 (L/255)^gamma                           |
+| q      | quality of JPEG                                | 1..100    | steps of ITU-T T.81, scaled as libjpeg does |
 
 Errors of lens and pose are not operations on a picture, because the picture lacks what they bring into view.
 `LensError` is for code that casts the rays; `warp` approximates the distortion on a picture.

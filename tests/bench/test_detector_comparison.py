@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import synthetic
 
-from lgmdjax.bench import closed_loop, cost, fitting, tables, worlds
+from lgmdjax.bench import closed_loop, cost, fitting, stages, tables, worlds
 from lgmdjax.bench.settings import CAMERA_FAULTS, CLOSED_LOOP_SCALES
 from lgmdjax.cli import bench_all, main
 from lgmdjax.cli.flags import BenchFlags
@@ -24,7 +24,7 @@ from lgmdjax.sensors import camera_faults
 from lgmdjax.simulation import assembly, episodes, recording, rerender
 
 SMOKE = CLOSED_LOOP_SCALES["smoke"]
-OWN = [closed_loop.OWN]
+OWN = [stages.OWN]
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +55,13 @@ def test_a_wrong_detector_is_refused_before_any_work(given, words):
 
 def test_a_plan_has_a_stage_for_each_detector(robot):
     names = ["robot", "emd", "lgmdjax.detectors:dsn"]
-    stages, settings = closed_loop.plan(robot, names, SMOKE)
-    assert [stage.name for stage in stages] == [
+    planned, settings = closed_loop.plan(robot, names, SMOKE)
+    assert [stage.name for stage in planned] == [
         "walks", "detector-robot", "detector-emd", "detector-lgmdjax.detectors-dsn", "references", "scores",
     ]  # fmt: skip
-    assert {stage.name for stage in stages} == set(settings)
+    assert {stage.name for stage in planned} == set(settings)
     assert settings["detector-lgmdjax.detectors-dsn"].source == "dsn"
-    assert stages[-1].inputs == tuple(stage.name for stage in stages[1:-1])
+    assert planned[-1].inputs == tuple(stage.name for stage in planned[1:-1])
 
 
 def test_the_worlds_have_the_rooms_that_they_should_have():
@@ -188,8 +188,8 @@ def test_one_table_and_one_page_have_all_benchmarks(results):
 
 
 def test_a_finished_comparison_is_not_repeated(results, monkeypatch, capsys):
-    for stages, function in ((closed_loop, "train"), (fitting, "fit_on_walks")):
-        monkeypatch.setattr(stages, function, lambda *_: pytest.fail("done again"))
+    for module, function in ((closed_loop, "train"), (fitting, "fit_on_walks")):
+        monkeypatch.setattr(module, function, lambda *_: pytest.fail("done again"))
     out = ["--scale", "smoke", "--detector", "dsn", "--out", str(results[0])]
     with jax.enable_x64(False):
         for benchmark in ("closed-loop", "fit"):
