@@ -44,7 +44,7 @@ else
 	'$(VENV)/bin/python' -m pytest -m 'not default_xla and not extended'
 endif
 
-# What `make test` leaves out: gradients of batches, long derivatives, and the slowest notebook.
+# What `make test` leaves out: gradients of batches, long derivatives, and the slowest notebooks.
 test-extended: setup
 	'$(VENV)/bin/python' -m pytest -m extended
 
