@@ -109,10 +109,12 @@ class Commands:
             ends = moved.terminated & ~is_over, moved.truncated & ~is_over
             return (after, is_over | begins | moved.state.done), (reward, *ends)
 
+        # Intermediates of pictures take too much memory to be stored for the backward pass; those of the rest do not.
         # The recomputed frame is inside a loop, where XLA cannot merge it with the first one.
-        remat = jax.checkpoint(frame, prevent_cse=False)
+        stored = not self.environment.settings.vision_gradient
+        scanned = frame if stored else jax.checkpoint(frame, prevent_cse=False)
         initial = state.environment, jnp.asarray(False)
-        (after, _), (rewards, terminated, truncated) = jax.lax.scan(remat, initial, jax.random.split(key, self.hold))
+        (after, _), (rewards, terminated, truncated) = jax.lax.scan(scanned, initial, jax.random.split(key, self.hold))
         u = after.sensed.u
         history = jnp.where(begins, actor.fill(u, self.depth), actor.push(state.history, u))
         observation, after = self._observe(State(environment=after, history=history))

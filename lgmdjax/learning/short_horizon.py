@@ -158,7 +158,7 @@ class State:
     """State of the training between two windows."""
 
     params: Params
-    robots: Robots
+    robots: Robots | None  # None within an update
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
     key: Array
@@ -223,10 +223,12 @@ def step(environment: Environment, state: State, settings: Settings) -> tuple[St
 
     Robots are sharded over the devices of this computer; not for use inside `jit`.
     """
+    assert state.robots is not None
     key, window_key, fit_key = jax.random.split(state.key, 3)
     found = gradient(environment, state.params, state.robots, window_key, settings=settings)
     # Through the host, since these are sharded over the robots' devices and parameters are not.
-    learnt, summary = _learn(state, jax.device_get(replace(found, robots=None)), fit_key, settings=settings)
+    gradients = jax.device_get(replace(found, robots=None))
+    learnt, summary = _learn(replace(state, robots=None), gradients, fit_key, settings=settings)
     return replace(learnt, robots=found.robots, key=key), summary
 
 
