@@ -158,7 +158,7 @@ class State:
     """State of the training between two windows."""
 
     params: Params
-    robots: Robots | None  # None within an update
+    robots: PyTree  # of type `Robots`; None within an update
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
     key: Array
@@ -223,7 +223,6 @@ def step(environment: Environment, state: State, settings: Settings) -> tuple[St
 
     Robots are sharded over the devices of this computer; not for use inside `jit`.
     """
-    assert state.robots is not None
     key, window_key, fit_key = jax.random.split(state.key, 3)
     found = gradient(environment, state.params, state.robots, window_key, settings=settings)
     # Through the host, since these are sharded over the robots' devices and parameters are not.
@@ -239,7 +238,7 @@ class Gradient:
     objective: Float[Array, " robots"]
     grad: PyTree  # of `Actor`, with an axis of robots
     window: Window
-    robots: Robots | None
+    robots: PyTree  # of type `Robots`; None within an update
 
 
 @partial(jax.jit, static_argnames="settings")

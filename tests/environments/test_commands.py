@@ -32,7 +32,7 @@ class Counted:
         return u, counted_state(u, jnp.asarray(False))
 
     def step(self, key, state, action):
-        u = jnp.where(state.done, START, state.sensed.u + 0.01)
+        u = START + (state.sensed.u + 0.01 - START) * ~state.done
         ends = (u[0] > START + 0.045) & ~state.done
         outcome: Any = None
         reward = action[0] * ~state.done
