@@ -61,7 +61,7 @@ class VectorEnvironment(VecEnv):
     def reset(self) -> np.ndarray:
         """Begin an episode of every robot; return the observations."""
         self.states, observations = _reset(self.environment, self._next_key(), robots=self.num_envs)
-        return np.asarray(observations, np.float32)
+        return np.array(observations, np.float32)
 
     def warm_up(self) -> None:
         """Compile everything, and forget what happened."""

@@ -204,7 +204,7 @@ def init(key: Array, environment: Environment, settings: Settings) -> State:
     inputs, actions = environment.observation_size, environment.action_size
     actor = Actor(
         layers=perceptron.create(actor_key, (inputs, *settings.units, actions), 0.01),
-        log_std=jnp.full(actions, settings.log_std),
+        log_std=jnp.full(actions, settings.log_std, float),
     )
     critic = perceptron.create(critic_key, (inputs + environment.privileged_size, *settings.units, 1))
     weights: PyTree = actor, critic
