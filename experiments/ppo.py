@@ -66,8 +66,9 @@ class VectorEnvironment(VecEnv):
     def warm_up(self) -> None:
         """Compile everything, and forget what happened."""
         self.reset()
+        observations, *_ = self.step(self.actions)
+        self._begin(np.arange(1), observations)
         self.step(self.actions)
-        self._begin(np.arange(1), np.zeros((self.num_envs, *(self.observation_space.shape or ())), np.float32))
         self.rewards = []
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -115,7 +116,9 @@ class VectorEnvironment(VecEnv):
             chosen = robots[first : first + RESETS]
             rows = np.full(RESETS, self.num_envs, np.int32)  # beyond the last robot: dropped
             rows[: len(chosen)] = chosen
-            self.states, fresh = _replace(self.environment, self._next_key(), self.states, rows)
+            states, fresh = _replace(self.environment, self._next_key(), self.states, rows)
+            # On the devices where they were, or all would be compiled again for other ones.
+            self.states = jax.tree.map(lambda new, old: jax.device_put(new, old.sharding), states, self.states)
             observations[chosen] = np.asarray(fresh)[: len(chosen)]
 
     def _next_key(self) -> Array:
