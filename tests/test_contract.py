@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, PyTree
 
-from lgmdjax.control import braitenberg, compass, controller, names, navigator, policies
+from lgmdjax.control import actor, braitenberg, compass, controller, names, navigator, perceptron, policies
 from lgmdjax.detectors import d_lgmd, dsn, emd, eta, grm, lgmd, lgmd1_grouping, lgmd1_onoff, lgmd2, lplc2, scaled, tau
 from lgmdjax.detectors.protocol import Geometry
 from lgmdjax.locomotion import cpg, shaping
@@ -201,6 +201,13 @@ COMPONENTS = (
         lambda: navigator.create(jax.random.key(1), symmetric=True),
         lambda params, _: navigator.init(params),
         navigator.step,
+        uniform(0.5, 1.0, 2),
+    ),
+    Component(
+        "actor",
+        lambda: actor.Params(layers=perceptron.create(jax.random.key(1), (4, 8, 2)), depth=2, hold=2),
+        lambda params, _: actor.init(params),
+        actor.step,
         uniform(0.5, 1.0, 2),
     ),
     policy_component(policies.BLIND, lambda: policies.BlindParams(velocity=jnp.asarray([1.2, 1.1]))),

@@ -1,7 +1,9 @@
+from . import actor as actor
 from . import braitenberg as braitenberg
 from . import compass as compass
 from . import controller as controller
 from . import lstm as lstm
 from . import names as names
 from . import navigator as navigator
+from . import perceptron as perceptron
 from . import policies as policies

@@ -1,3 +1,4 @@
+from . import commands as commands
 from . import coverage as coverage
 from . import functional as functional
 from . import gym_env as gym_env

@@ -54,6 +54,14 @@ def step(state: State, position: Float[Array, "2"]) -> tuple[State, tuple[Float[
     return State(entered=state.entered.at[cell].set(True), covered=covered), (entered, new)
 
 
+def covered_at(state: State, position: Float[Array, "2"]) -> Float[Array, ""]:
+    """Return how much of the floor at a position [m] is covered, 0..1, interpolated between the cells' centres.
+
+    Gradient: by the position too; it jumps at the centres.
+    """
+    return jnp.sum(_shares(position) * state.covered)
+
+
 def _cell(position: Float[Array, "2"]) -> tuple[Array, Array]:
     """Return the row and the column of a position."""
     row, column = jnp.floor(position / CELL).astype(jnp.int32) % GRID

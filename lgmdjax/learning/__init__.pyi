@@ -12,3 +12,4 @@ from . import lgmd_grid_search as lgmd_grid_search
 from . import rollout_gradient as rollout_gradient
 from . import sequences as sequences
 from . import settings as settings
+from . import short_horizon as short_horizon
