@@ -381,8 +381,8 @@ def _run_stages_of(given: "flags.PipelineFlags", target: str) -> Path:
         own = custom_robot.read(given.robot)
         settings, robot_stages = {"robot": robot.settings_of(own), **settings}, (robot.make_stage(own),)
     run = open_run(given.out, given.name, given.scale, given.seed, settings)
-    from lgmdjax.pipeline.stages import STAGES
-
     track = given.track if distributed.is_first() else ""
-    with tracking.log_to(track, run.folder), object_store.keep_chunks(given.chunks, run.folder):
+    with object_store.keep_chunks(given.chunks, run.folder), tracking.log_to(track, run.folder):
+        from lgmdjax.pipeline.stages import STAGES
+
         return execute(run, (*robot_stages, *STAGES), target)

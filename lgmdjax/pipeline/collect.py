@@ -1,8 +1,8 @@
 """Stage collect: calibrate the LGMD on first walks, then record the teacher's walks in many rooms.
 
 Writes calibration.json and episodes/*.parquet, one file for each episode. The rooms of an episode depend on the seed
-and its number only, so that an interrupted run resumes with the episode that was interrupted, and the processes of a run
-(`lgmdjax.runtime.distributed`) record different episodes at once.
+and its number only, so that an interrupted run resumes with the episode that was interrupted, and several processes of
+a run (`lgmdjax.runtime.distributed`) record different episodes at once.
 """
 
 import dataclasses

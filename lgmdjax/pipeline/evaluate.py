@@ -49,9 +49,7 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: EvaluateSettings, se
             _write(folder, settings, records, robot, seed)
 
 
-def _write(
-    folder: Path, settings: EvaluateSettings, records: Records, robot: closed_loop.Params, seed: int
-) -> None:
+def _write(folder: Path, settings: EvaluateSettings, records: Records, robot: closed_loop.Params, seed: int) -> None:
     """Summarise the walks, and save what the figures need."""
     results = {
         trial: {policy: run_trial.summarise(trials.TRIALS[trial], record) for policy, record in by_policy.items()}

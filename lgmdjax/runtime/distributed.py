@@ -14,9 +14,9 @@
 In a process that `start` has not joined to others, there is one process, number 0, and nothing waits.
 
 All processes must come to the same waits in the same order. A process that ends or fails is noticed at the next wait:
-all others then raise `OtherProcessError`, and so end too. The chunks of walks that they have finished by then are on the disk,
-and a restart carries on from there. The engine is that of `jax.live_devices`, whose answer is a barrier over the
-processes that are alive; a process that was killed counts as alive for `HEARTBEAT` more seconds.
+all others then raise `OtherProcessError`, and so end too. The chunks of walks that they have finished by then are on
+the disk, and a restart carries on from there. The engine is that of `jax.live_devices`, whose answer is a barrier over
+the processes that are alive; a process that was killed counts as alive for `HEARTBEAT` more seconds.
 
 JAX keeps its coordinator in process 0. If process 0 is killed, JAX ends all others at once, with its own message
 ("Terminating process because the JAX distributed service detected fatal errors").
@@ -181,7 +181,7 @@ def share(place: str, compute: Callable[[], Any]) -> Any:
 
 
 def share_arrays(place: str, tree: TreeT) -> TreeT:
-    """Return in all processes process 0's tree of arrays, with the same bits; every process has one of its structure."""
+    """Return in all processes process 0's tree of arrays, with the same bits; all pass one of the same structure."""
     if count() == 1:
         return tree
     leaves, structure = jax.tree.flatten(tree)
@@ -219,9 +219,7 @@ def await_files(paths: Iterable[Path], seconds: float | None = None) -> None:
             time.sleep(0.2)
 
 
-def _place(
-    coordinator: str, processes: int | None, process: int | None
-) -> tuple[str, int, int, Sequence[int] | None]:
+def _place(coordinator: str, processes: int | None, process: int | None) -> tuple[str, int, int, Sequence[int] | None]:
     """Return address, number of processes, number of this process, and its GPUs (None for all)."""
     given = [bool(coordinator), processes is not None, process is not None]
     if any(given) and not all(given):

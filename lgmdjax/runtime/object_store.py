@@ -88,8 +88,8 @@ def read(pointer: Path) -> bytes:
     content = get(facts["url"])
     if checksums.digest(content) != facts["object"]:
         raise InputError(
-            f"{facts['url']}: expected the object that {pointer} names, got {len(content)} bytes with another checksum; "
-            "restore it, or delete the stage and collect again"
+            f"{facts['url']}: expected the object that {pointer} names, got {len(content)} bytes with another "
+            "checksum; restore it, or delete the stage and collect again"
         )
     return content
 

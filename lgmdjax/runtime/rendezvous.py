@@ -93,9 +93,10 @@ def _gather(server: socket.socket, own: Member, deadline: float, seconds: float)
             with contextlib.suppress(TimeoutError):
                 _admit(server.accept()[0], own, present)
         missing = sorted(set(range(1, own.processes)) - present.keys())
+        names = ", ".join(map(str, missing[:8])) + " and others" * (len(missing) > 8)
         fault = (
-            f"expected {own.processes} processes within {seconds:g} s, got none with number "
-            f"{', '.join(map(str, missing[:8]))}{' and others' * (len(missing) > 8)}; start all with the same --processes"
+            f"expected {own.processes} processes within {seconds:g} s, got none with number {names}; "
+            "start all with the same --processes"
         )
         for connection in present.values():
             _answer(connection, fault if missing else GO)
@@ -129,7 +130,8 @@ def _find_fault(member: object, own: Member, present: dict[int, socket.socket]) 
         return "expected a process of lgmdjax, got something else"
     for name, value in (("version", own.version), ("task", own.task), ("processes", own.processes)):
         if member.get(name) != value:
-            return f"expected {name} {value} as in process 0, got {member.get(name)}; start all processes with the same flags"
+            found = member.get(name)
+            return f"expected {name} {value} as in process 0, got {found}; start all processes with the same flags"
     number = member.get("process")
     if not isinstance(number, int) or not 0 < number < own.processes:
         return f"expected a --process of 1 to {own.processes - 1}, got {number}; number the processes from 0"
@@ -177,8 +179,9 @@ def _report(host: str, port: int, own: Member, deadline: float, seconds: float) 
     if answer.startswith("expected"):
         raise InputError(answer)
     if answer != GO:
+        found = "another service" if answer else "none"
         raise InputError(
-            f"expected process 0 to wait for processes at {host}:{port}, got {'another service' if answer else 'none'}; "
+            f"expected process 0 to wait for processes at {host}:{port}, got {found}; "
             f"if the run is already going, it has another process of number {own.process}: give each its own --process"
         )
 

@@ -11,7 +11,7 @@ nothing with other processes. The streams of a fit are divided among all of them
 """
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -23,6 +23,7 @@ from lgmdjax.runtime import distributed
 
 ResultT = TypeVar("ResultT")
 TreeT = TypeVar("TreeT")
+Device = Any  # `jax.Device`, which type checkers do not take for a type
 
 MIN_STREAMS = 8  # on one device; fewer take as long as these
 
@@ -84,7 +85,7 @@ def stream_device_count(streams: int) -> int:
     return max(count for count in range(1, most + 1) if streams % count == 0)
 
 
-def stream_devices(streams: int) -> list[jax.Device]:
+def stream_devices(streams: int) -> list[Device]:
     """Return the devices of a fit: equally many of each process; those of this process if there are few streams."""
     processes = distributed.count()
     if processes > 1:
@@ -125,5 +126,5 @@ def _stream_spec(axis: int) -> PartitionSpec:
     return PartitionSpec(*(None,) * axis, "streams")
 
 
-def _mesh(devices: list[jax.Device], axis: str) -> Mesh:
+def _mesh(devices: list[Device], axis: str) -> Mesh:
     return Mesh(np.asarray(devices), (axis,))

@@ -81,7 +81,10 @@ def test_without_process_0_the_others_end_after_the_time_limit() -> None:
 
 
 def test_processes_of_different_runs_are_refused() -> None:
-    other = [Member(process=1, processes=3, task="collect smoke-0"), Member(process=1, processes=2, task="train quick-0")]
+    other = [
+        Member(process=1, processes=3, task="collect smoke-0"),
+        Member(process=1, processes=2, task="train quick-0"),
+    ]
     faults = meet(free_address(), [*members([0], 2), *other], seconds=0.5)
     assert "expected processes 2 as in process 0, got 3" in faults[1]
     assert "expected task collect smoke-0 as in process 0, got train quick-0" in faults[2]
@@ -156,7 +159,9 @@ def test_each_item_is_dealt_once(monkeypatch) -> None:
 
 def test_files_that_do_not_appear_end_the_wait(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(distributed, "_group", distributed._Group(number=1, count=2, client=None))
-    with pytest.raises(InputError, match="expected .*run.json from another process within 0.1 s, got none; put --out on"):
+    with pytest.raises(
+        InputError, match=r"expected .*run.json from another process within 0.1 s, got none; put --out on"
+    ):
         distributed.await_files([tmp_path / "run.json"], seconds=0.1)
 
 

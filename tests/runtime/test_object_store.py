@@ -82,10 +82,12 @@ def test_objects_that_are_gone_or_changed_are_refused(place):
     memory = fsspec.filesystem("memory")
     name = next(iter(memory.store))
     memory.pipe_file(name, b"other")
-    with pytest.raises(InputError, match="expected the object that .*chunk-00000.json names, got 5 bytes with another"):
+    with pytest.raises(
+        InputError, match=r"expected the object that .*chunk-00000.json names, got 5 bytes with another"
+    ):
         episodes.read(place / "episodes")
     memory.rm_file(name)
-    with pytest.raises(InputError, match="expected memory://bucket.* to give an object, got FileNotFoundError"):
+    with pytest.raises(InputError, match=r"expected memory://bucket.* to give an object, got FileNotFoundError"):
         episodes.read(place / "episodes")
 
 
@@ -94,7 +96,9 @@ def test_a_chunk_that_is_not_stored_has_no_pointer(place, monkeypatch):
         raise PermissionError("Access Denied")
 
     monkeypatch.setattr(type(fsspec.filesystem("memory")), "pipe_file", refuse)
-    with pytest.raises(InputError, match="to take an object, got PermissionError: Access Denied; check that the bucket"):
+    with pytest.raises(
+        InputError, match="to take an object, got PermissionError: Access Denied; check that the bucket"
+    ):
         write(place / "episodes")
     assert not list((place / "episodes").iterdir())
 
@@ -130,17 +134,18 @@ def test_s3(tmp_path, monkeypatch):
     monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
     code = (
         "from moto.server import ThreadedMotoServer; s = ThreadedMotoServer('127.0.0.1', 0); s.start();"
-        "print(s.get_host_and_port()[1], flush=True); input()"
+        "print('port', s.get_host_and_port()[1], flush=True); input()"
     )
     server = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=dict(os.environ)
     )
     assert server.stdout is not None
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.stdout.readline().strip()}")
+    port = next(line.split()[1] for line in server.stdout if line.startswith("port"))
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{port}")
     try:
         run = tmp_path / "run"
         with (
-            pytest.raises(InputError, match="s3://walks/run/.trial.* to take an object, got .*bucket does not exist"),
+            pytest.raises(InputError, match=r"s3://walks/run/.trial.* to take an object, got .*bucket does not exist"),
             object_store.keep_chunks("s3://walks", run),
         ):
             pass
