@@ -110,6 +110,7 @@ def start(
         coordinator_bind_address=rendezvous.bind_address(address),
         cluster_detection_method="deactivate",
     )
+    jax.local_devices()  # at its first use JAX waits for all processes' lists of devices: here, where all are
     _group = _Group(number=own, count=count, client=jax_distributed.global_state.client)
 
 
