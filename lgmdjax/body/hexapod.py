@@ -75,7 +75,8 @@ def build(model: mujoco.MjModel | None = None) -> mjx.Model:
                 "describe the robot in a TOML file (docs/howto/robot.md)"
             )
     with jax.numpy_dtype_promotion("standard"):
-        return _uncommit(mjx.put_model(model, impl="jax"))
+        # MJX's own choice is the first device of all processes, which in most processes is not theirs.
+        return _uncommit(mjx.put_model(model, device=jax.local_devices()[0], impl="jax"))
 
 
 def soften_contacts(model: mjx.Model) -> mjx.Model:
@@ -119,7 +120,7 @@ def init(model: mjx.Model, start: Float[Array, "3"], angles: Float[Array, "6 3"]
     # Not `put_data`: under x64 its contact indices are narrower than those of a step, and the carry of a loop must keep
     # its types.
     with jax.numpy_dtype_promotion("standard"):  # MJX multiplies booleans by floats
-        data = _uncommit(mjx.make_data(model))
+        data = _uncommit(mjx.make_data(model, device=jax.local_devices()[0]))
     return reset(model, data, start, angles)
 
 

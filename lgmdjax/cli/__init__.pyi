@@ -11,6 +11,7 @@ from . import export as export
 from . import flags as flags
 from . import hardware_flags as hardware_flags
 from . import main as main
+from . import processes as processes
 from . import servos as servos
 from . import sim_robot as sim_robot
 from . import streams as streams

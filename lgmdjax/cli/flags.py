@@ -54,6 +54,18 @@ class PipelineFlags:
     """TOML file that describes a robot of your own (docs/howto/robot.md); the package's robot if left out"""
     track: str = ""
     """log of the curves of fits: tensorboard, or module:function for your own log(step, values)"""
+    distributed: tyro.conf.FlagCreatePairsOff[bool] = False
+    """share the work with other processes, started with the same flags; SLURM or Open MPI say which one this is"""
+    coordinator: str = ""
+    """without SLURM and Open MPI: HOST:PORT of process 0, at which the processes find each other"""
+    processes: int | None = None
+    """with --coordinator: number of processes"""
+    process: int | None = None
+    """with --coordinator: number of this process, from 0"""
+    wait: float = 300.0
+    """how long processes wait for each other at the start [s]"""
+    chunks: str = ""
+    """URL of an object store for the recorded walks, such as s3://bucket/prefix (docs/howto/many_machines.md)"""
     settings: Annotated[Mapping[str, object], tyro.conf.arg(name="")]
 
 

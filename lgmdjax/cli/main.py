@@ -12,13 +12,16 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from inspect import getdoc
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from lgmdjax import __version__
 from lgmdjax.cli import environment, streams
 from lgmdjax.errors import InputError, one_line
 from lgmdjax.runtime import interruption
 from lgmdjax.runtime.jax_setup import collect_garbage_rarely, prepare_jax, prepare_opengl
+
+if TYPE_CHECKING:
+    from lgmdjax.cli import flags
 
 RESUMES, RESTARTS = "the same command resumes", "the same command starts again"  # after an interruption
 NOT_RESUMED = (
@@ -358,6 +361,16 @@ def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequen
     given = flags.parse_pipeline(name, _summary(command), arguments)
     tracking.check(given.track)
     environment.check_jax()
+    from lgmdjax.cli import processes
+
+    with processes.joined(given, name):
+        return _run_stages_of(given, target)
+
+
+def _run_stages_of(given: "flags.PipelineFlags", target: str) -> Path:
+    """Run the stages up to a target, with the other processes if there are some."""
+    from lgmdjax.cli import tracking
+    from lgmdjax.runtime import distributed, object_store
     from lgmdjax.runtime.run_folders import execute, open_run
 
     settings, robot_stages = given.settings, ()
@@ -368,7 +381,8 @@ def _run_stages(target: str, arguments: Sequence[str], command: Callable[[Sequen
         own = custom_robot.read(given.robot)
         settings, robot_stages = {"robot": robot.settings_of(own), **settings}, (robot.make_stage(own),)
     run = open_run(given.out, given.name, given.scale, given.seed, settings)
-    from lgmdjax.pipeline.stages import STAGES
+    track = given.track if distributed.is_first() else ""
+    with object_store.keep_chunks(given.chunks, run.folder), tracking.log_to(track, run.folder):
+        from lgmdjax.pipeline.stages import STAGES
 
-    with tracking.log_to(given.track, run.folder):
         return execute(run, (*robot_stages, *STAGES), target)

@@ -34,7 +34,7 @@ def read(run: Path) -> Recording:
 
     Raises InputError for a folder without recorded walks, and for damaged ones.
     """
-    folders = [run / place for place in PLACES if any((run / place).glob("chunk-*.parquet"))]
+    folders = [run / place for place in PLACES if episodes.has_chunks(run / place)]
     if not folders:
         raise InputError(
             f"expected a run folder with walks, or a folder with chunk-*.parquet, got {run} without; "

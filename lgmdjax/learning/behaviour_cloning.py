@@ -42,7 +42,7 @@ from lgmdjax.control import navigator
 from lgmdjax.errors import InputError
 from lgmdjax.learning.checkpoints import Checkpoints, resumable
 from lgmdjax.learning.sequences import SequenceBatch, pack
-from lgmdjax.runtime import checksums, tracking
+from lgmdjax.runtime import checksums, distributed, tracking
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import finite, sharding
 from lgmdjax.simulation.episodes import Walk
@@ -131,6 +131,7 @@ def fit(
     """
     settings = _require_sound(settings or Settings(), train, test)
     params = replace(standardise(params, train, settings.mirrored), symmetric=False)
+    params = distributed.share_arrays("fit: start", params)
     data = _pack(params, train, settings), _pack(params, test, settings)
     initial = _initial_progress(params, settings)
     if checkpoints is None:
@@ -223,8 +224,11 @@ def _run_epochs(
 ) -> Progress:
     """Run the remaining epochs, a hundredth of all epochs in one call, with a progress bar."""
 
+    streams = data[0].is_first.shape[-1]
+    divided, shared = sharding.divide_streams(data, streams, axis=2), sharding.replicate(params, streams)
+
     def advance(progress: Progress, epoch: int, end: int) -> Progress:
-        progress = _train_epochs(params, progress, data, end - epoch, settings)
+        progress = _train_epochs(shared, sharding.replicate(progress, streams), divided, end - epoch, settings)
         # Through the host, since the result is on all devices, and checkpoints and callers expect it on one.
         return jax.tree.map(jnp.asarray, jax.device_get(progress))
 

@@ -4,6 +4,8 @@ Each checkpoint stores the identity of its fit, a fingerprint of data, settings 
 another identity refuses the checkpoint. Only the newest checkpoint is kept; one that was interrupted while it was
 written is ignored. The checksum of the progress is stored with the identity; checkpoints of versions before 0.3.0 have
 none. A checkpoint is refused if an array that was finite at the start of the fit is not finite in it.
+
+Of several processes that compute one fit (`lgmdjax.runtime.distributed`) the first writes and reads the checkpoints.
 """
 
 import json
@@ -20,7 +22,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
 from lgmdjax.errors import InputError, one_line
-from lgmdjax.runtime import checksums, interruption
+from lgmdjax.runtime import checksums, distributed, interruption
 from lgmdjax.runtime.storage import JsonObject
 
 Progress = TypeVar("Progress")
@@ -38,7 +40,17 @@ class Checkpoints:
         for name in ("absl", "asyncio"):  # orbax logs a line for every file, and errors that it raises as well
             logging.getLogger(name).setLevel(logging.CRITICAL)
         self.folder, self.identity = Path(folder).absolute(), json.loads(json.dumps(identity))
-        options = ocp.CheckpointManagerOptions(max_to_keep=1, create=True, enable_async_checkpointing=False)
+        if not distributed.is_first():
+            return
+        own, is_single = jax.process_index(), jax.process_count() == 1
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=1,
+            create=is_single,  # orbax refuses to if only some of several processes save
+            enable_async_checkpointing=False,
+            multiprocessing_options=ocp.options.MultiprocessingOptions(
+                primary_host=own, active_processes=None if is_single else {own}
+            ),
+        )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.manager = ocp.CheckpointManager(self.folder, options=options)
@@ -50,12 +62,19 @@ class Checkpoints:
     def restore_latest(self, initial: Progress) -> tuple[int, Progress]:
         """Return the newest checkpoint as (step, progress), or (0, `initial`) if there is none.
 
-        `initial` also gives structure, shapes and dtypes of what is read.
+        `initial` also gives structure, shapes and dtypes of what is read. All processes return that of the first.
         """
+        if distributed.count() == 1:
+            return self._restore(initial)
+        found = self._restore(initial) if distributed.is_first() else (0, initial)
+        step, progress = distributed.share_arrays(f"{self.folder}: checkpoint", (np.asarray(found[0]), found[1]))
+        return int(step), progress
+
+    def _restore(self, initial: Progress) -> tuple[int, Progress]:
         step = self.manager.latest_step()
         if step is None:
             return 0, initial
-        template = jax.tree.map(ocp.utils.to_shape_dtype_struct, initial)
+        template = jax.tree.map(ocp.utils.to_shape_dtype_struct, _for_orbax(initial))
         try:
             identity = ocp.args.Composite(belongs=ocp.args.JsonRestore())  # pyright: ignore
             found = self.manager.restore(step, args=identity)["belongs"]
@@ -77,6 +96,9 @@ class Checkpoints:
 
     def save(self, step: int, progress: PyTree) -> None:
         """Write progress; it is complete on disk when this returns."""
+        if not distributed.is_first():
+            return
+        progress = _for_orbax(progress)
         identity = self.identity | {checksums.CHECKSUM_KEY: _digest(progress)}
         args = ocp.args.Composite(
             progress=ocp.args.StandardSave(progress),  # pyright: ignore
@@ -90,6 +112,8 @@ class Checkpoints:
 
     def close(self) -> None:
         """Close the folder."""
+        if not distributed.is_first():
+            return
         try:
             self.manager.close()
         except Exception as error:
@@ -139,6 +163,11 @@ def resumable(
             checkpoints.save(step, progress)
             last_saved = time.monotonic()
         yield step, progress
+
+
+def _for_orbax(progress: Progress) -> Progress:
+    """Return progress as orbax can write it: of several processes, it refuses arrays that are on devices of one."""
+    return jax.tree.map(np.asarray, progress) if jax.process_count() > 1 else progress
 
 
 def _digest(progress: PyTree) -> str:

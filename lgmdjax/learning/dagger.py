@@ -23,6 +23,7 @@ from lgmdjax.evaluation import metrics
 from lgmdjax.learning import behaviour_cloning, sequences
 from lgmdjax.learning.settings import DaggerSettings, TrainSettings
 from lgmdjax.locomotion import cpg
+from lgmdjax.runtime import distributed
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, room_batches
 from lgmdjax.simulation.episodes import Walk
@@ -141,7 +142,8 @@ def select_turn_gain(
     rooms = randomisation.randomise_cameras(rooms, camera_faults, randomisation.TRAINING_PROBABILITY)
     rows, candidates = [], []
     for turn_gain in settings.turn_gains:
-        candidates.append(behaviour_cloning.rescale_turns(fit.best, test, turn_gain))
+        rescaled = behaviour_cloning.rescale_turns(fit.best, test, turn_gain)
+        candidates.append(distributed.share_arrays(f"turn gain {turn_gain:g}", rescaled))
         record = _walk_with_gain(
             folder, robot, candidates[-1], rooms, settings, turn_gain=turn_gain, seed=seed, faults=camera_faults
         )
@@ -203,7 +205,8 @@ def _run_round(
 ) -> list[Walk]:
     """Fit the navigator to all walks so far, roll it out for one episode, and return its labelled walks."""
     path = folder / "walks" / f"round-{number}"
-    if not recording.is_recorded(path, settings.robots):
+    place = f"DAgger round {number + 1}"
+    if not distributed.share(f"{place}: start", lambda: recording.is_recorded(path, settings.robots)):
         train, test = sequences.split_by_room(episodes.segments(walks), HELD_OUT_FRACTION, seed)
         fit = behaviour_cloning.fit(
             navigator.create(jax.random.key(seed), variant),
@@ -212,7 +215,8 @@ def _run_round(
             behaviour_cloning.Settings(epochs=settings.round_epochs),
             checkpoints=folder / "checkpoints" / f"round-{number}",
         )
-        learner = assembly.with_policy(robot, "learned", behaviour_cloning.rescale_turns(fit.best, test))
+        rescaled = distributed.share_arrays(f"{place}: navigator", behaviour_cloning.rescale_turns(fit.best, test))
+        learner = assembly.with_policy(robot, "learned", rescaled)
         recording.record_rollouts(
             path,
             learner,

@@ -1,7 +1,8 @@
 """Stage collect: calibrate the LGMD on first walks, then record the teacher's walks in many rooms.
 
 Writes calibration.json and episodes/*.parquet, one file for each episode. The rooms of an episode depend on the seed
-and its number only, so that an interrupted run resumes with the episode that was interrupted.
+and its number only, so that an interrupted run resumes with the episode that was interrupted, and several processes of
+a run (`lgmdjax.runtime.distributed`) record different episodes at once.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ from lgmdjax.control import braitenberg, policies
 from lgmdjax.detectors import lgmd
 from lgmdjax.learning import lgmd_grid_search
 from lgmdjax.pipeline.settings import CollectSettings
+from lgmdjax.runtime import distributed
 from lgmdjax.runtime.storage import JsonObject, write_json
 from lgmdjax.simulation import assembly, closed_loop, episodes, recording, rollout, room_batches
 from lgmdjax.simulation.assembly import load_detector
@@ -27,19 +29,26 @@ CALIBRATION_EPISODE = 2**20  # an episode number beyond all others: its rooms ar
 def run(folder: Path, inputs: Mapping[str, Path], settings: CollectSettings, seed: int) -> None:
     """Calibrate the detector, then record every episode that is not on disk yet."""
     gait = inputs["fit-gait"]
-    if not (folder / "calibration.json").exists():
-        write_json(folder / "calibration.json", _calibrate(gait, settings, seed))
+    calibration = folder / "calibration.json"
+
+    def calibrate() -> None:
+        if not calibration.exists():
+            write_json(calibration, _calibrate(gait, settings, seed))
+
+    distributed.only_first("collect: calibration", calibrate)
+    distributed.await_files([calibration])
     detector = load_detector(folder)
     params = _teacher_robot(gait, settings, detector)
     model = closed_loop.build_model(params)
     writer = episodes.Writer(folder / "episodes", _parameters(settings, detector))
-    for episode in range(writer.chunks, settings.episodes):
-        label = f"collect: episode {episode + 1} of {settings.episodes}"
-        rooms = randomisation.training_rooms(seed, episode, settings.robots, settings.camera_faults)
-        chunks = recording.rollout_with_progress(params, model, rooms, settings.seconds, label)
-        record = rollout.concatenate_time(list(chunks))
-        numbers = episode * settings.robots + np.arange(settings.robots)
-        writer.write(record, episode=episode, rooms=numbers.tolist(), seed=seed)
+    with recording.dealt_chunks(writer, settings.episodes) as own:
+        for episode in own:
+            label = f"collect: episode {episode + 1} of {settings.episodes}"
+            rooms = randomisation.training_rooms(seed, episode, settings.robots, settings.camera_faults)
+            chunks = recording.rollout_with_progress(params, model, rooms, settings.seconds, label)
+            record = rollout.concatenate_time(list(chunks))
+            numbers = episode * settings.robots + np.arange(settings.robots)
+            writer.write(record, episode=episode, rooms=numbers.tolist(), seed=seed, number=episode)
 
 
 def read_camera_faults(header: JsonObject) -> tuple[FaultName, ...]:

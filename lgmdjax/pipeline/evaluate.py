@@ -27,6 +27,7 @@ from lgmdjax.evaluation.settings import TrialPlan
 from lgmdjax.pipeline.settings import EvaluateSettings
 from lgmdjax.reporting import selection
 from lgmdjax.reporting.figures import style
+from lgmdjax.runtime import distributed
 from lgmdjax.runtime.storage import write_arrays, write_json
 from lgmdjax.sensors import camera
 from lgmdjax.sensors.settings import Resolution
@@ -43,6 +44,13 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: EvaluateSettings, se
         plan.trial: {policy: _record(folder, plan, robot, policy, seed) for policy in plan.policies}
         for plan in settings.trials
     }
+    if distributed.is_first():
+        with distributed.alone():
+            _write(folder, settings, records, robot, seed)
+
+
+def _write(folder: Path, settings: EvaluateSettings, records: Records, robot: closed_loop.Params, seed: int) -> None:
+    """Summarise the walks, and save what the figures need."""
     results = {
         trial: {policy: run_trial.summarise(trials.TRIALS[trial], record) for policy, record in by_policy.items()}
         for trial, by_policy in records.items()

@@ -5,6 +5,8 @@ folders of its inputs by their names, and gets its settings (`lgmdjax.pipeline.s
 `lgmdjax.runtime.run_folders` decides when a stage runs, and moves its files into place. The folder may hold files of an
 interrupted attempt; a stage resumes from them or overwrites them. A stage without settings in a scale is left out, also
 from the inputs of other stages.
+
+Of several processes (`lgmdjax.runtime.distributed`) all run the stages that are `shared`; the first runs the others.
 """
 
 from lgmdjax.pipeline import collect, evaluate, fit_gait, report, train
@@ -21,9 +23,9 @@ STUDIES = (
 )
 STAGES = (
     Stage(name="fit-gait", run=fit_gait.run, inputs=("robot",)),  # of `lgmdjax.pipeline.robot`, if there is one
-    Stage(name="collect", run=collect.run, inputs=("fit-gait",)),
-    Stage(name="train", run=train.run, inputs=("fit-gait", "collect")),
-    Stage(name="evaluate", run=evaluate.run, inputs=_ROBOT),
+    Stage(name="collect", run=collect.run, inputs=("fit-gait",), shared=True),
+    Stage(name="train", run=train.run, inputs=("fit-gait", "collect"), shared=True),
+    Stage(name="evaluate", run=evaluate.run, inputs=_ROBOT, shared=True),
     *STUDIES,
     Stage(name="report", run=report.run, inputs=(*_ROBOT, "evaluate", *(study.name for study in STUDIES))),
 )

@@ -23,7 +23,7 @@ from lgmdjax.errors import InputError
 from lgmdjax.learning import behaviour_cloning, dagger, sequences
 from lgmdjax.learning.settings import TrainSettings
 from lgmdjax.pipeline import collect
-from lgmdjax.runtime import schema
+from lgmdjax.runtime import distributed, schema
 from lgmdjax.runtime.storage import write_arrays, write_json
 from lgmdjax.simulation import assembly, episodes
 from lgmdjax.simulation.closed_loop import FRAME_RATE
@@ -38,7 +38,8 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     header = episodes.read_parameters(inputs["collect"] / "episodes")
     baselines = _baselines(episodes.segments(recorded))
     schema.check(assembly.BASELINES, baselines, "baselines", "collect again")
-    write_arrays(folder / "baselines.npz", baselines)
+    if distributed.is_first():
+        write_arrays(folder / "baselines.npz", baselines)
     detector = assembly.load_detector(inputs["collect"])
     recorded_with = assembly.read_camera_settings(header)
     robot = assembly.assemble_robot(inputs["fit-gait"], recorded_with, detector, assembly.make_policies())
@@ -54,6 +55,8 @@ def run(folder: Path, inputs: Mapping[str, Path], settings: TrainSettings, seed:
     learned, turn_gains = dagger.select_turn_gain(
         folder, robot, fits["lstm"], test, settings, seed=seed, camera_faults=faults
     )
+    if not distributed.is_first():
+        return
     result = {
         "curves": {
             name: {"train": fit.train_mse.tolist(), "test": fit.test_mse.tolist()} for name, fit in fits.items()

@@ -1,12 +1,15 @@
 from . import checksums as checksums
 from . import compiled_code as compiled_code
+from . import distributed as distributed
 from . import export_cache as export_cache
 from . import interruption as interruption
 from . import jax_setup as jax_setup
 from . import mjx as mjx
+from . import object_store as object_store
 from . import partial_files as partial_files
 from . import program_cache as program_cache
 from . import pytree_json as pytree_json
+from . import rendezvous as rendezvous
 from . import run_folders as run_folders
 from . import schema as schema
 from . import seeds as seeds

@@ -12,6 +12,9 @@ A stage's fingerprint covers its settings, the seed, the versions of its format 
 its inputs. A stage is up to date if its folder has the fingerprint that the stage would get now, and its files have the
 checksums that they had when it finished. run.json and done.json have a checksum of their own.
 
+Of several processes (`lgmdjax.runtime.distributed`) the first one holds the lock, decides which stages run, and writes
+all files but recorded walks. The others run the stages that are `shared` with it, and wait for it meanwhile.
+
 Folders of format 1 (version 0.1.0) have other names for some settings. Their robots can be loaded; their stages cannot
 be resumed.
 """
@@ -32,7 +35,16 @@ from filelock import FileLock, Timeout
 
 from lgmdjax import __version__
 from lgmdjax.errors import InputError, one_line
-from lgmdjax.runtime import checksums, compiled_code, partial_files, schema, seeds, storage, versions
+from lgmdjax.runtime import (
+    checksums,
+    compiled_code,
+    distributed,
+    partial_files,
+    schema,
+    seeds,
+    storage,
+    versions,
+)
 from lgmdjax.runtime.storage import JsonObject
 
 FORMAT = 2  # of the run folder; no stage is resumed in a folder of another format
@@ -54,6 +66,7 @@ class Stage:
     run: StageFunction
     inputs: tuple[str, ...] = ()  # names of stages
     version: int = 1  # raise it when the files of the stage change their meaning
+    shared: bool = False  # whether all processes of a run work on it, or the first one alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,10 +95,12 @@ def open_run(
     requested = {"format": FORMAT, "scale": scale, "seed": seed, "settings": _to_json(settings)}
     try:
         partial_files.make_folder(run.folder)
-        if not (run.folder / "run.json").exists():
+        if distributed.is_first() and not (run.folder / "run.json").exists():
             with _locked(run):
                 facts = checksums.add_checksum(requested | {"versions": versions.installed()})
                 storage.write_json(run.folder / "run.json", facts)
+        distributed.wait(f"{run.folder}: start")
+        distributed.await_files([run.folder / "run.json"])
         _check_same(run, requested)
         (run.folder / ".lock").touch()
     except OSError as error:
@@ -112,13 +127,14 @@ def execute(run: Run, stages: Sequence[Stage], target: str) -> Path:
     required = _required_stages({stage.name: stage for stage in stages}, target)
     fingerprints: dict[str, str] = {}
     with _locked(run):
-        for abandoned in run.folder.glob(f"*{checksums.PARTIAL}"):
+        for abandoned in run.folder.glob(f"*{checksums.PARTIAL}") if distributed.is_first() else ():
             abandoned.unlink(missing_ok=True)
         for stage in stages:
             if stage.name in required:
                 settings = run.settings[stage.name]
                 fingerprints[stage.name] = fingerprint(stage, settings, run.seed, fingerprints)
-                _update(run, stage, fingerprints[stage.name])
+                update = _update if distributed.is_first() else _join
+                update(run, stage, fingerprints[stage.name])
     return run.folder / target
 
 
@@ -138,9 +154,10 @@ def fingerprint(stage: Stage, settings: object, seed: int, inputs: Mapping[str, 
 
 def describe_devices() -> str:
     """Name the devices that JAX computes on."""
-    devices = jax.devices()
+    devices = jax.local_devices()
     kind = devices[0].device_kind if devices[0].platform != "cpu" else f"cpu, {os.cpu_count()} cores"
-    return kind if len(devices) == 1 else f"{len(devices)} x {kind}"
+    described = kind if len(devices) == 1 else f"{len(devices)} x {kind}"
+    return described if distributed.count() == 1 else f"{distributed.count()} processes with {described}"
 
 
 def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
@@ -149,10 +166,12 @@ def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
     fault = _find_fault(final, stage_fingerprint)
     if fault is None:
         print(f"{stage.name}: up to date in {final}", flush=True)
+        _tell_start(stage, runs=False)
+        distributed.wait(f"{stage.name}: end")
         return
     if fault:
         print(f"{stage.name}: done again, because {fault}", flush=True)
-    partial = run.folder / f"{stage.name}{checksums.PARTIAL}-{stage_fingerprint}"
+    partial = _partial(run, stage, stage_fingerprint)
     _adopt_stamp(partial)
     if _find_fault(partial, stage_fingerprint) is not None:  # None if the process was killed before the move below
         (partial / checksums.STAMP).unlink(missing_ok=True)
@@ -161,10 +180,38 @@ def _update(run: Run, stage: Stage, stage_fingerprint: str) -> None:
         _print_start(stage, final, run.seed, resumed=partial.exists())
         seconds = _run_in(partial, run, stage, stage_fingerprint)
         print(f"{stage.name}: done in {seconds:.0f} s", flush=True)
+    else:
+        _tell_start(stage, runs=False)
     if final.exists():
         shutil.rmtree(final)
     os.replace(partial, final)
     partial_files.sync(run.folder)
+    distributed.wait(f"{stage.name}: end")
+
+
+def _join(run: Run, stage: Stage, stage_fingerprint: str) -> None:
+    """Do this process's part of a stage that the first process runs; wait for it otherwise."""
+    if _tell_start(stage) and stage.shared:
+        partial = _partial(run, stage, stage_fingerprint)
+        inputs = _inputs(run, stage)
+        distributed.await_files([partial, *(folder / checksums.STAMP for folder in inputs.values())])
+        stage.run(partial, inputs, run.settings[stage.name], run.seed)
+        distributed.wait(f"{stage.name}: files")
+    distributed.wait(f"{stage.name}: end")
+
+
+def _tell_start(stage: Stage, *, runs: bool = True) -> bool:
+    """Return whether a stage runs, which the first process tells the others."""
+    return distributed.share(f"{stage.name}: start", lambda: runs)
+
+
+def _partial(run: Run, stage: Stage, stage_fingerprint: str) -> Path:
+    return run.folder / f"{stage.name}{checksums.PARTIAL}-{stage_fingerprint}"
+
+
+def _inputs(run: Run, stage: Stage) -> dict[str, Path]:
+    """Return the folders of a stage's inputs by name."""
+    return {name: run.folder / name for name in stage.inputs}
 
 
 def _adopt_stamp(folder: Path) -> None:
@@ -180,8 +227,11 @@ def _run_in(folder: Path, run: Run, stage: Stage, stage_fingerprint: str) -> flo
     folder.mkdir(exist_ok=True)
     partial_files.remove_partial_files(folder)
     start = time.perf_counter()
-    inputs = {name: run.folder / name for name in stage.inputs}
-    stage.run(folder, inputs, run.settings[stage.name], run.seed)
+    _tell_start(stage)
+    with contextlib.nullcontext() if stage.shared else distributed.alone():
+        stage.run(folder, _inputs(run, stage), run.settings[stage.name], run.seed)
+    if stage.shared:
+        distributed.wait(f"{stage.name}: files")
     seconds = time.perf_counter() - start
     compiled_code.clear_caches_if_near_limit()
     facts = {"fingerprint": stage_fingerprint, "seconds": round(seconds, 1), "versions": versions.installed()}
@@ -281,7 +331,13 @@ def _first_difference(found: object, expected: object, key: str = "") -> tuple[s
 
 @contextlib.contextmanager
 def _locked(run: Run) -> Iterator[None]:
-    """Hold the lock of a run folder; the operating system releases it however the process ends."""
+    """Hold the lock of a run folder; the operating system releases it however the process ends.
+
+    Of several processes of a run, only the first holds it.
+    """
+    if not distributed.is_first():
+        yield
+        return
     try:
         lock = FileLock(run.folder / ".lock").acquire(blocking=False)
     except Timeout as error:

@@ -17,7 +17,8 @@ A walk is the recorded trajectory of one robot in one room.
 | is_first, resets, ok          | -        | first frame after a start or reset, resets so far, healthy  |
 
 Pictures are not stored: `lgmdjax.simulation.rerender` renders them again from the poses. A walk is written in chunks.
-Each chunk is a file that gets its name when it is complete, so that an interruption loses only the present chunk.
+Each chunk is a file that gets its name when it is complete, so that an interruption loses only the present chunk. It
+may be an object of a store instead, with a pointer in the folder (`lgmdjax.runtime.object_store`).
 Numbers keep their precision. The header has a checksum of the columns and of itself; files of earlier versions have
 none. A file is refused if it has other columns or types, missing or infinite numbers in frames that are ok, time that
 does not increase, or a walk in two rooms.
@@ -29,9 +30,10 @@ Source: Cizek & Faigl, sec. 4.2 and 5.1: the training data are segments of colli
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -40,7 +42,7 @@ import pyarrow.parquet as pq
 from flax import struct
 
 from lgmdjax.errors import InputError, one_line
-from lgmdjax.runtime import checksums, partial_files, schema, versions
+from lgmdjax.runtime import checksums, distributed, object_store, partial_files, schema, versions
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.sensors import hemifield
 from lgmdjax.simulation import episode_tables, finite
@@ -54,6 +56,9 @@ RENAMED = {1: {"fresh": "is_first", "setbacks": "resets"}, 2: {}, VERSION: {}}
 """Versions that can be read, each with its former names of columns and their present names."""
 NEAREST_ONLY = (1, 2)
 """Versions without distances along the corridor: their teacher reacted to the nearest distances."""
+
+PARQUET: Mapping[str, Any] = {"compression": "zstd", "write_page_checksum": True}
+"""How a chunk is written."""
 
 HEADER = schema.Object(
     {"format": schema.Text((FORMAT,)), "parameters": schema.Object()},
@@ -80,7 +85,9 @@ class Walk(Record):
 
 
 class Writer:
-    """Writes walks into a folder, one file for each chunk, after the chunks that are already there.
+    """Writes walks into a folder, one file for each chunk, after or between the chunks that are already there.
+
+    Of several processes (`lgmdjax.runtime.distributed`) only the first looks at those that are there.
 
     Args:
         folder: created if missing.
@@ -97,29 +104,45 @@ class Writer:
         partial_files.require_utf8(self.folder)
         try:
             partial_files.make_folder(self.folder)
-            partial_files.remove_partial_files(self.folder)
+            if distributed.is_first():
+                partial_files.remove_partial_files(self.folder)
         except OSError as error:
             raise InputError(f"{folder}: expected a folder to write to, got {error}; choose another") from error
-        self.chunks = len(_files(self.folder)) and len(_tables(self.folder, self.parameters))
+        if distributed.is_first():
+            _tables(self.folder, self.parameters, may_lack_chunks=True)
+        self.chunks = max(_numbers(self.folder), default=-1) + 1
 
-    def write(self, record: Record, *, episode: int, rooms: Sequence[int], seed: int) -> Path:
-        """Write one chunk of a batch of walks and return its path.
+    def missing(self, total: int) -> list[int]:
+        """Return the numbers below `total` of the chunks that the folder does not have."""
+        return sorted(set(range(total)) - set(_numbers(self.folder)))
+
+    def write(
+        self, record: Record, *, episode: int, rooms: Sequence[int], seed: int, number: int | None = None
+    ) -> Path:
+        """Write one chunk of a batch of walks; return its path, or that of its pointer if it goes to an object store.
 
         Args:
             record: axes (robot, frame), finite in all frames that are ok.
             episode: index of the batch.
             rooms: index of the room of each robot.
             seed: seed of the rooms.
+            number: of the chunk; the next one if None.
         """
         table = episode_tables.from_record(record, episode, rooms, seed)
-        path = self.folder / f"chunk-{self.chunks:05d}.parquet"
+        number = self.chunks if number is None else number
+        path = self.folder / f"chunk-{number:05d}.parquet"
         table = table.replace_schema_metadata(self._metadata(table))
-        try:
-            with partial_files.replacing(path) as partial:
-                pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
-        except OSError as error:
-            raise InputError(f"{path}: expected to write a chunk, got {error}; free some disk") from error
-        self.chunks += 1
+        url = object_store.url_of(path)
+        if url:
+            path = path.with_suffix(object_store.POINTER_SUFFIX)
+            object_store.write(url, _encode(table), path)
+        else:
+            try:
+                with partial_files.replacing(path) as partial:
+                    pq.write_table(table, partial, **PARQUET)
+            except OSError as error:
+                raise InputError(f"{path}: expected to write a chunk, got {error}; free some disk") from error
+        self.chunks = max(self.chunks, number + 1)
         return path
 
     def _metadata(self, table: pa.Table) -> dict[str, str]:
@@ -221,16 +244,45 @@ def _walk(folder: Path | str, columns: Mapping[str, np.ndarray]) -> Walk:
     return Walk(episode=episode, robot=robot, room=room, seed=seed, **arrays)
 
 
+def has_chunks(folder: Path) -> bool:
+    """Tell whether a folder has recorded walks."""
+    return bool(_files(folder))
+
+
+def count_chunks(folder: Path) -> int:
+    """Return the number of chunks in a folder."""
+    return len(_files(folder))
+
+
+def chunk_paths(folder: Path, numbers: Iterable[int]) -> list[Path]:
+    """Return the paths that chunks of some numbers have in a folder: of their files, or of their pointers."""
+    paths = [folder / f"chunk-{number:05d}.parquet" for number in numbers]
+    return [path.with_suffix(object_store.POINTER_SUFFIX) if object_store.url_of(path) else path for path in paths]
+
+
 def _files(folder: Path) -> list[Path]:
-    return sorted(folder.glob("chunk-*.parquet"))
+    """Return the files and pointers of all chunks, in order."""
+    suffixes = (".parquet", object_store.POINTER_SUFFIX)
+    return sorted((path for path in folder.glob("chunk-*") if path.suffix in suffixes), key=lambda path: path.stem)
 
 
-def _tables(folder: Path, parameters: JsonObject | None) -> list[pa.Table]:
+def _numbers(folder: Path) -> list[int]:
+    return [int(number) for path in _files(folder) if (number := path.stem.removeprefix("chunk-")).isdecimal()]
+
+
+def _encode(table: pa.Table) -> bytes:
+    """Return a table as the bytes of a Parquet file."""
+    stream = pa.BufferOutputStream()
+    pq.write_table(table, stream, **PARQUET)
+    return stream.getvalue().to_pybytes()
+
+
+def _tables(folder: Path, parameters: JsonObject | None, *, may_lack_chunks: bool = False) -> list[pa.Table]:
     """Return the checked tables of all chunks, in order."""
     tables = []
     expected = None if parameters is None else json.loads(json.dumps(parameters))
     for number, path in enumerate(_files(folder)):
-        if path.name != f"chunk-{number:05d}.parquet":
+        if path.stem != f"chunk-{number:05d}" and not may_lack_chunks:
             raise InputError(f"{folder}: expected chunk-{number:05d}.parquet, got {path.name}; a chunk is missing")
         header, table = _load(path)
         found = header["parameters"]
@@ -246,7 +298,8 @@ def _tables(folder: Path, parameters: JsonObject | None) -> list[pa.Table]:
 def _load(path: Path) -> tuple[JsonObject, pa.Table]:
     """Return the checked header and the table of a chunk."""
     try:
-        content = pa.BufferReader(checksums.read_bytes(path))
+        is_pointer = path.suffix == object_store.POINTER_SUFFIX
+        content = pa.BufferReader(object_store.read(path) if is_pointer else checksums.read_bytes(path))
         with pq.ParquetFile(content, page_checksum_verification=True) as file:
             header = _check_header(path, file.schema_arrow.metadata or {})
             if file.metadata.num_rows > episode_tables.MAX_ROWS:  # before memory is allocated

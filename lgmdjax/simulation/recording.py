@@ -1,6 +1,7 @@
 """Rollouts of any number of robots on the host, with a progress bar, returned or recorded in a folder."""
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from tqdm.auto import tqdm
 
 from lgmdjax.control import policies
 from lgmdjax.control.names import PolicyName
-from lgmdjax.runtime import interruption
+from lgmdjax.runtime import distributed, interruption
 from lgmdjax.runtime.mjx import mjx
 from lgmdjax.runtime.storage import JsonObject
 from lgmdjax.simulation import closed_loop, episodes
@@ -97,16 +98,17 @@ def rollout_in_batches(
     label: str,
     *,
     render: bool = True,
-    skip_batches: int = 0,
+    batches: Iterable[int] | None = None,
 ) -> Iterator[tuple[list[int], closed_loop.Record]]:
     """Roll out any number of robots in batches of one of `BATCH_SIZES`, yielding indices of robots and their record.
 
     All batches have one size and share one compiled program: the last batch is padded with copies of its last robot,
-    which are cut from the record. The first `skip_batches` are left out.
+    which are cut from the record. `batches` has the numbers of those that are rolled out; None means all.
     """
     robots = rooms.starts.shape[0]
     size = _batch_size(robots)
-    for first in range(skip_batches * size, robots, size):
+    for number in range(count_batches(robots)) if batches is None else batches:
+        first = number * size
         present = list(range(first, min(first + size, robots)))
         padded = np.minimum(np.arange(first, first + size, dtype=np.int32), robots - 1)
         batch = jax.tree.map(lambda leaf, padded=padded: leaf[padded], rooms)
@@ -129,7 +131,8 @@ def record_rollouts(
 ) -> closed_loop.Record:
     """Roll out a policy and record it in a folder, one file for each batch; return the whole record.
 
-    Batches that the folder already has are not repeated.
+    Batches that the folder already has are not repeated. The others are dealt over all processes of the run, if there
+    are several; each of them returns the whole record.
 
     Args:
         folder: where to write.
@@ -143,23 +146,48 @@ def record_rollouts(
         render: whether to render the cameras; if None, only for policies that use them.
     """
     writer = episodes.Writer(folder, parameters)
-    batches = rollout_in_batches(
-        select_policy(params, policy),
-        closed_loop.build_model(params),
-        rooms,
-        seconds,
-        f"{label}: {policy.name}",
-        render=policy.uses_camera if render is None else render,
-        skip_batches=writer.chunks,
-    )
-    for indices, record in batches:
-        writer.write(record, episode=writer.chunks, rooms=indices, seed=seed)
+    robots = rooms.starts.shape[0]
+    with dealt_chunks(writer, count_batches(robots)) as own:
+        batches = rollout_in_batches(
+            select_policy(params, policy),
+            closed_loop.build_model(params),
+            rooms,
+            seconds,
+            f"{label}: {policy.name}",
+            render=policy.uses_camera if render is None else render,
+            batches=own,
+        )
+        for indices, record in batches:
+            number = indices[0] // _batch_size(robots)
+            writer.write(record, episode=number, rooms=indices, seed=seed, number=number)
     return episodes.stack_walks(episodes.read(folder))
+
+
+@contextlib.contextmanager
+def dealt_chunks(writer: episodes.Writer, total: int) -> Iterator[list[int]]:
+    """Yield the numbers of the chunks that this process has to record, of `total`; then wait for all other processes.
+
+    Chunks that the folder has are left out. Of those that are missing, process k of N records each N-th, from the k-th
+    on. Their content depends on their number only, never on the process.
+    """
+    missing = distributed.share(f"{writer.folder}: start", lambda: writer.missing(total))
+    yield distributed.deal(missing)
+    distributed.wait(f"{writer.folder}: end")
+    distributed.await_files(episodes.chunk_paths(writer.folder, missing))
 
 
 def is_recorded(folder: Path, robots: int) -> bool:
     """Return whether a folder of `record_rollouts` has all batches of this number of robots."""
-    return len(list(folder.glob("chunk-*.parquet"))) * _batch_size(robots) >= robots
+    return episodes.count_chunks(folder) >= count_batches(robots)
+
+
+def count_batches(robots: int) -> int:
+    """Return the number of batches in which some robots are rolled out.
+
+    >>> count_batches(4), count_batches(16), count_batches(40)
+    (1, 1, 3)
+    """
+    return -(-robots // _batch_size(robots))
 
 
 def _batch_size(robots: int) -> int:

@@ -1,22 +1,29 @@
-"""Sharding of robots, and of the streams of a fit, over the devices of this computer.
+"""Sharding of robots over the devices of this process, and of the streams of a fit over those of all processes.
 
 Robots are independent of each other, so they can run in parallel. CPU cores become devices if `JAX_NUM_CPU_DEVICES` is
 set before JAX starts, as the command line does. One robot cannot be divided among cores, since its physics is a long
 sequence of small operations. Streams of recorded walks are independent too, except that all share the weights, whose
 gradient is summed over the devices.
+
+Of several processes (`lgmdjax.runtime.distributed`) each rolls out robots of its own, so that a rollout exchanges
+nothing with other processes. The streams of a fit are divided among all of them, if each device then has
+`MIN_STREAMS`; if not, every process computes the whole fit.
 """
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
+
+from lgmdjax.runtime import distributed
 
 ResultT = TypeVar("ResultT")
 TreeT = TypeVar("TreeT")
+Device = Any  # `jax.Device`, which type checkers do not take for a type
 
 MIN_STREAMS = 8  # on one device; fewer take as long as these
 
@@ -30,7 +37,7 @@ def shard_robots(work: Callable[..., ResultT], *batches: PyTree) -> ResultT:
     """
     robots = jax.tree.leaves(batches)[0].shape[0]
     devices = device_count(robots)
-    mesh = _mesh(devices, "robots")
+    mesh = _mesh(jax.local_devices()[:devices], "robots")
     spec = PartitionSpec("robots")
     # check_vma is off: robots exchange nothing, and MJX starts its loops with constants, which the check refuses.
     sharded = jax.shard_map(work, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
@@ -60,8 +67,7 @@ def shard_streams(work: Callable[..., ResultT], batches: PyTree, shared: tuple[P
         axis: of the streams in every leaf of `batches`.
     """
     streams = jax.tree.leaves(batches)[0].shape[axis]
-    mesh = _mesh(stream_device_count(streams), "streams")
-    spec = PartitionSpec(*(None,) * axis, "streams")
+    mesh, spec = _mesh(stream_devices(streams), "streams"), _stream_spec(axis)
     specs = (spec, *(PartitionSpec(),) * len(shared))
     # check_vma is off: it would sum gradients over the devices by itself, leaf by leaf, which takes longer.
     return jax.shard_map(work, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False)(batches, *shared)
@@ -79,5 +85,46 @@ def stream_device_count(streams: int) -> int:
     return max(count for count in range(1, most + 1) if streams % count == 0)
 
 
-def _mesh(devices: int, axis: str) -> Mesh:
-    return Mesh(np.asarray(jax.local_devices()[:devices]), (axis,))
+def stream_devices(streams: int) -> list[Device]:
+    """Return the devices of a fit: equally many of each process; those of this process if there are few streams."""
+    processes = distributed.count()
+    if processes > 1:
+        by_process = [jax.local_devices(process_index=process) for process in range(processes)]
+        for each in range(min(map(len, by_process)), 0, -1):
+            if streams % (each * processes) == 0 and streams // (each * processes) >= MIN_STREAMS:
+                return [device for devices in by_process for device in devices[:each]]
+    return jax.local_devices()[: stream_device_count(streams)]
+
+
+def divide_streams(batches: TreeT, streams: int, *, axis: int) -> TreeT:
+    """Return the batches of `shard_streams` on the devices of all processes, if these compute it together.
+
+    Every process passes the same values, whole; one that computes alone gets them back as they are.
+    """
+    return _place(batches, streams, _stream_spec(axis))
+
+
+def replicate(shared: TreeT, streams: int) -> TreeT:
+    """Return the further arguments of `shard_streams` as `divide_streams` does its batches, whole on every device."""
+    return _place(shared, streams, PartitionSpec())
+
+
+def _place(tree: TreeT, streams: int, spec: PartitionSpec) -> TreeT:
+    devices = stream_devices(streams)
+    if all(device.process_index == jax.process_index() for device in devices):
+        return tree
+    sharding = NamedSharding(_mesh(devices, "streams"), spec)
+
+    def place(leaf: PyTree) -> jax.Array:
+        value = np.asarray(leaf)
+        return jax.make_array_from_callback(value.shape, sharding, lambda index: value[index])
+
+    return jax.tree.map(place, tree)
+
+
+def _stream_spec(axis: int) -> PartitionSpec:
+    return PartitionSpec(*(None,) * axis, "streams")
+
+
+def _mesh(devices: list[Device], axis: str) -> Mesh:
+    return Mesh(np.asarray(devices), (axis,))

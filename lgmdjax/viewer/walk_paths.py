@@ -6,6 +6,8 @@ from lgmdjax.errors import InputError
 
 FOLDERS = (".", "trial", "evaluate/testing/learned", "collect/episodes")
 """Subfolders that may hold walks; the first that does is read."""
+CHUNKS = ("chunk-*.parquet", "chunk-*.json")
+"""Files of walks, and pointers to those in an object store."""
 
 
 def find_walks(path: Path) -> tuple[Path, set[int] | None]:
@@ -19,6 +21,6 @@ def find_walks(path: Path) -> tuple[Path, set[int] | None]:
     if not path.exists():
         raise InputError(f"expected a run, a trial or a chunk-*.parquet, found no {path}; check the path")
     for name in FOLDERS:
-        if any((path / name).glob("chunk-*.parquet")):
+        if any(any((path / name).glob(chunks)) for chunks in CHUNKS):
             return path / name, None
     raise InputError(f"expected recorded walks in {path}, found none; `lgmdjax trial indoor` makes some")
