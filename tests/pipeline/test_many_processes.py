@@ -50,6 +50,11 @@ def finish(started: list[subprocess.Popen[str]]) -> list[str]:
     return [output for output, _ in outputs]
 
 
+def without_gloo(output: str) -> str:
+    """Return what a process printed, without the lines of the library that connects CPUs."""
+    return "".join(line for line in output.splitlines(keepends=True) if not line.startswith("[Gloo]"))
+
+
 def chunks(out: Path) -> dict[str, bytes]:
     folder = out / "run" / "collect" / "episodes"
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
@@ -78,7 +83,7 @@ def unrecorded(single, tmp_path) -> Path:
 
 @pytest.mark.parametrize("processes", [1, 2, 4])
 def test_any_number_of_processes_records_the_same_bytes(single, unrecorded, processes):
-    first, *others = finish(start(unrecorded, processes))
+    first, *others = (without_gloo(output) for output in finish(start(unrecorded, processes)))
     assert "collect: done in" in first and others == [""] * (processes - 1)
     assert len(chunks(single)) == EPISODES and chunks(unrecorded) == chunks(single)
 
