@@ -16,7 +16,7 @@ from nbformat import NotebookNode
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-EXTENDED = ("04_gradients", "06_own_detector", "08_own_robot", "09_own_parameter")  # take minutes each
+EXTENDED = ("04_gradients", "05_detectors", "06_own_detector", "08_own_robot", "09_own_parameter")  # minutes each
 MAX_BYTES = 2**20  # of all notebooks together
 RELATIVE, ABSOLUTE = 1e-2, 1e-3
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
