@@ -1,6 +1,6 @@
 """Reinforcement learning without a teacher: PPO and SHAC on the same number of simulated frames.
 
-    python experiments/reinforcement_learning.py [--methods ppo shac] [--seeds 0 1 2] [--frames 300000] [--out FOLDER]
+    python experiments/reinforcement_learning.py [--methods ppo shac] [--seeds 0 1 2] [--frames 150000] [--out FOLDER]
 
 Both train the same actor (`lgmdjax.control.actor`) in the same environment (`lgmdjax.environments.commands`): the last
 u of both LGMDs as observation, velocities as actions, new floor less touches as reward (`rewards.floor`).
@@ -270,7 +270,7 @@ def main(
     *,
     methods: tuple[Method, ...] = ("ppo", "shac"),
     seeds: tuple[int, ...] = (0, 1, 2),
-    frames: int = 300_000,
+    frames: int = 150_000,
     robots: int = 32,
     discount: float = 0.99,
     trace: float = 0.95,
@@ -278,7 +278,7 @@ def main(
     log_std: float = -1.0,
     window: int = 10,
     vision_gradient: bool = False,
-    rooms: int = 32,
+    rooms: int = 16,
     seconds: float = 90.0,
     out: Path = Path("runs/reinforcement_learning"),
 ) -> None:
