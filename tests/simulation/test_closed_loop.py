@@ -164,9 +164,9 @@ def faulty(room: closed_loop.Room, **faults: float) -> closed_loop.Room:
 
 def test_responses_rest_until_the_first_late_picture_and_are_those_of_late_pictures(params, model, room, monkeypatch):
     """With pictures that are two frames late; those of the scene are replaced by noise."""
-    pictures = jnp.round(
-        jax.random.uniform(jax.random.key(7), (8, *camera.image_shape(params.camera)), minval=0, maxval=9)
-    )
+    grey = params.camera.width / camera_faults.SENSOR_WIDTH  # to which pictures are rounded
+    noise = jax.random.uniform(jax.random.key(7), (8, *camera.image_shape(params.camera)), minval=0, maxval=9)
+    pictures = grey * jnp.round(noise / grey)
     ranges = jnp.full(params.laser.rays, 5.0)
     monkeypatch.setattr(closed_loop, "sense", lambda params, scene, state, render: (pictures[state.frame], ranges))
 
