@@ -40,7 +40,7 @@ test: setup
 ifdef ARGS
 	'$(VENV)/bin/python' -m pytest $(ARGS)
 else
-	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m default_xla
+	LGMDJAX_TEST_DEFAULT_XLA=1 '$(VENV)/bin/python' -m pytest -m 'default_xla and not extended'
 	'$(VENV)/bin/python' -m pytest -m 'not default_xla and not extended'
 endif
 
