@@ -64,7 +64,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Where only the files for the default flags are asked for, do not import the others in every process."""
     is_other = collection_path.suffix == ".py" and collection_path.name not in DEFAULT_XLA_FILES
-    return True if is_other and config.getoption("markexpr").startswith("default_xla") else None
+    return True if is_other and str(config.getoption("markexpr")).startswith("default_xla") else None
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
