@@ -17,7 +17,7 @@ position and heading, and has a derivative by both.
 
 import math
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,6 @@ MAX_RANGE = 5.0  # m
 RADII = (0.25, 0.5, 1.0)  # m, of the rings on which the covered floor is sampled
 RING = 8  # points on a ring
 PRIVILEGED = RAYS + 1 + RING * len(RADII) + 2  # features
-Tree = TypeVar("Tree")
 
 
 @struct.dataclass(kw_only=True)
@@ -88,10 +87,6 @@ class Commands:
         u, state = self.environment.reset(key)
         return self._observe(State(environment=state, history=actor.fill(u, self.depth)))
 
-    def ended(self, key: Array) -> State:
-        """Return the state of an episode that has ended (`functional.Environment.ended`)."""
-        return State(environment=self.environment.ended(key), history=actor.fill(jnp.zeros(2), self.depth))
-
     def step(self, key: Array, state: State, action: Float[Array, "2"]) -> Transition:
         """Return the transition that a command causes; after the end of an episode, the start of the next.
 
@@ -104,7 +99,7 @@ class Commands:
         ) -> tuple[tuple[functional.State, Bool[Array, ""]], tuple[Array, Array, Array]]:
             before, is_over = carry
             moved = self.environment.step(key, before, velocity)
-            after = _choose(is_over, before, moved.state)
+            after = functional.choose(is_over, before, moved.state)
             reward = jnp.where(is_over, 0.0, moved.reward)
             ends = moved.terminated & ~is_over, moved.truncated & ~is_over
             return (after, is_over | begins | moved.state.done), (reward, *ends)
@@ -165,8 +160,3 @@ def _rings(heading: Float[Array, ""]) -> Float[Array, "points 2"]:
     angles = heading + jnp.arange(RING, dtype=heading.dtype) * (2 * math.pi / RING)
     ring = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
     return jnp.concatenate([jnp.zeros((1, 2), ring.dtype), *(radius * ring for radius in RADII)])
-
-
-def _choose(condition: Bool[Array, ""], chosen: Tree, otherwise: Tree) -> Tree:
-    """Choose between two pytrees of one structure."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), chosen, otherwise)

@@ -139,7 +139,7 @@ class Environment:
         truncated = (moved.robot.frame >= self.frames) & ~ends & ~state.done
         moved = replace(moved, done=terminated | truncated)
         reward = jnp.where(state.done, 0.0, self.settings.reward(outcome))
-        observation, after = self._observe(_choose(state.done, self._begin(key), moved))
+        observation, after = self._observe(choose(state.done, self._begin(key), moved))
         return Transition(observation, after, reward, terminated, truncated, outcome)
 
     def room_of(self, state: State) -> Room:
@@ -282,6 +282,6 @@ def _sense_nothing() -> policies.Observation:
     return policies.Observation(u=zeros, feed_forward=zeros, excitation=zeros, distances=zeros, corridor=zeros)
 
 
-def _choose(condition: Bool[Array, ""], chosen: Tree, otherwise: Tree) -> Tree:
-    """Choose between two pytrees of one structure."""
+def choose(condition: Bool[Array, ""], chosen: Tree, otherwise: Tree) -> Tree:
+    """Return one of two pytrees of the same structure."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), chosen, otherwise)
